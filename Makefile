@@ -1,0 +1,98 @@
+# `make` alone lists the targets. Everything is set up in .venv; `make clean` takes it all away again.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+MAKEFLAGS += --no-builtin-rules
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+.ONESHELL:
+.SILENT:
+
+PYTHON ?= python3
+SCENARIO ?= subway
+RUNS ?= 10
+PYTEST_ARGS ?=
+
+RUN_READY := .venv/run.ready
+DEV_READY := .venv/dev.ready
+COMPILE := .venv/bin/python -m uv pip compile pyproject.toml --universal --generate-hashes --group build \
+	--no-header --no-annotate --no-emit-index-url --quiet
+
+.PHONY: help hil test long lint types lock clean
+
+help: ## list the targets
+	sed -nE 's/^([a-z]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 14
+
+hil: $(RUN_READY) ## set up and run the main job: SCENARIO=subway RUNS=10, traces in runs/
+	.venv/bin/ato-hil run "$(SCENARIO)" --mode hil --runs "$(RUNS)" --out "runs/$(SCENARIO)"
+	echo
+	echo "Trace: runs/$(SCENARIO)/trace.rrd"
+	echo "Open:  .venv/bin/rerun runs/$(SCENARIO)/trace.rrd"
+
+test: $(DEV_READY) ## set up and pass the fast tests
+	.venv/bin/python -m pytest -n 2 -q -m "not long and not pil and not uml" $(PYTEST_ARGS)
+
+long: $(DEV_READY) ## pass the long tests
+	.venv/bin/python -m pytest -q -m "long and not pil and not uml" $(PYTEST_ARGS)
+
+lint: $(DEV_READY) ## ruff: lint and format
+	.venv/bin/python -m ruff check .
+	.venv/bin/python -m ruff format --check .
+
+types: $(DEV_READY) ## mypy
+	.venv/bin/python -m mypy
+
+lock: $(DEV_READY) ## renew the locks from pyproject.toml (LOCK_ARGS=--upgrade: newest versions)
+	$(COMPILE) $(LOCK_ARGS) --output-file requirements.lock
+	$(COMPILE) $(LOCK_ARGS) --extra test --extra dev --constraints requirements.lock \
+		--output-file requirements-dev.lock
+
+clean: ## remove .venv, runs/ and every cache
+	rm -rf .venv build dist runs .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The files below .venv say that a set-up finished; they are touched last.
+$(RUN_READY): pyproject.toml requirements.lock
+	$(call set_up,requirements.lock)
+	touch $@
+
+$(DEV_READY): pyproject.toml requirements-dev.lock
+	$(call set_up,requirements-dev.lock)
+	touch $(RUN_READY) $@
+
+define set_up
+if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
+	if ! version=$$("$(PYTHON)" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null); then
+		echo "$(PYTHON) does not run. Name Python 3.11 or newer: make PYTHON=python3.12" >&2
+		exit 1
+	fi
+	if ! "$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
+		echo "ato-hil needs Python 3.11 or newer, and $(PYTHON) is $$version." \
+			"Name a newer one: make PYTHON=python3.12" >&2
+		exit 1
+	fi
+	# Debian and Ubuntu keep what venv needs in a package of its own.
+	if ! "$(PYTHON)" -c 'import ensurepip' 2>/dev/null; then
+		if [ "$$(id -u)" != 0 ] || ! command -v apt-get >/dev/null; then
+			echo "Python's venv is missing. Install it, then run make again:" \
+				"sudo apt-get install -y python$$version-venv" >&2
+			exit 1
+		fi
+		echo "Installing python$$version-venv"
+		apt-get update -qq
+		DEBIAN_FRONTEND=noninteractive apt-get install -y -qq "python$$version-venv" >/dev/null
+	fi
+	echo "Making .venv with Python $$version"
+	"$(PYTHON)" -m venv --clear .venv
+fi
+echo "Installing the packages of $(1) into .venv"
+export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_INPUT=1
+PYTHONUNBUFFERED=1 .venv/bin/python -m pip install --no-deps --only-binary :all: --require-hashes \
+	--progress-bar off -r $(1) | while IFS= read -r line; do
+	case "$$line" in
+	*Downloading*MB\)) wheel=$${line#*Downloading }; echo "  $${wheel%%-*} ($${wheel##* (}" ;;
+	Installing*) echo "  unpacking" ;;
+	esac
+done
+.venv/bin/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+endef

@@ -1,0 +1,1 @@
+"""The interface: the DBC, the codec derived from it, end-to-end protection, the bus."""

@@ -1,0 +1,212 @@
+"""Opens the bus that a name stands for, and moves mailbox frames over any python-can bus.
+
+| name | bus |
+| --- | --- |
+| `auto` | vcan0 where it exists, else a private vcan, else the embedded hub |
+| `hub`, `hub:CHANNEL` | the embedded hub (`can_dbc.hub`); the default channel is vcan0 |
+| `vcan` | a private vcan in a network namespace of its own |
+| `socketcan:NAME` | the network interface NAME of the Linux kernel |
+| `INTERFACE:CHANNEL` | any other interface of python-can |
+
+A mailbox frame is `(can_id, payload)`: a standard data frame of 8 bytes, the payload read as a
+little-endian signed 64-bit integer.
+"""
+
+import errno
+import os
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+
+from can_dbc.hub import DEFAULT_CHANNEL, FOREIGN, HubBus
+from can_dbc.hub_server import ERROR, EXTENDED, REMOTE
+
+__all__ = [
+    "FOREIGN",
+    "BusChoice",
+    "BusError",
+    "choose_bus",
+    "open_bus",
+    "private_vcan_reason",
+    "recv_frames",
+    "send_frames",
+    "socketcan_reason",
+]
+
+EXPECTED = "expected auto, hub, hub:CHANNEL, vcan, socketcan:NAME or INTERFACE:CHANNEL"
+
+_HUB_INTERFACE = "atohub"
+_SO_RCVBUFFORCE = 33  # asm-generic/socket.h; not in the socket module
+# The kernel's default loses all but the first 278 frames of a burst; this holds some 80 000.
+_RECEIVE_BUFFER_BYTES = 64 << 20
+_SEND_TIMEOUT_S = 1.0  # socketcan: how long a full transmit queue may stay full
+_MAX_FRAMES = 1024  # per call of recv_frames, so that it returns under any load
+
+
+class BusError(ValueError):
+    """A bus cannot be had; one line that names it and says why."""
+
+
+@dataclass(frozen=True)
+class BusChoice:
+    """The bus that a name was resolved to, and why."""
+
+    interface: str  # of python-can
+    channel: str
+    reason: str
+
+    @property
+    def name(self) -> str:
+        """The name under which other processes open the same bus."""
+        interface = "hub" if self.interface == _HUB_INTERFACE else self.interface
+        return f"{interface}:{self.channel}"
+
+
+def open_bus(name: str, **kwargs: Any) -> can.BusABC:
+    """Open the bus called `name`.
+
+    :param kwargs: for python-can, as `receive_own_messages`, `fd`, `can_filters`, `bitrate`.
+    :raises BusError: there is no such bus, or it cannot be opened.
+    """
+    choice = choose_bus(name)
+    try:
+        if choice.interface == _HUB_INTERFACE:
+            return HubBus(choice.channel, **kwargs)
+        # Without ignore_config, ~/.canrc or ./can.ini could put us on another bus.
+        bus = can.Bus(choice.channel, choice.interface, ignore_config=True, **kwargs)
+    except Exception as error:  # vendors' drivers raise what they like
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise BusError(f"bus {name!r}: cannot open {choice.name}: {reason}") from error
+    if choice.interface == "socketcan":
+        _enlarge_receive_buffer(bus)
+    return bus
+
+
+def choose_bus(name: str) -> BusChoice:
+    """Resolve the name of a bus to an interface and a channel of python-can.
+
+    :raises BusError: the name is malformed, or names a bus that this machine does not have.
+    """
+    if name == "auto":
+        return _best_bus()
+    if name == "vcan":
+        raise BusError(f"bus 'vcan': cannot have a private vcan: {private_vcan_reason()}")
+    if name == "hub":
+        return BusChoice(_HUB_INTERFACE, DEFAULT_CHANNEL, "asked for")
+    interface, _, channel = name.partition(":")
+    if not interface or not channel:
+        raise BusError(f"bus {name!r}: {EXPECTED}")
+    if interface in ("hub", _HUB_INTERFACE):
+        return BusChoice(_HUB_INTERFACE, channel, "asked for")
+    if interface not in can.VALID_INTERFACES:
+        known = ", ".join(sorted(can.VALID_INTERFACES))
+        raise BusError(f"bus {name!r}: unknown interface {interface!r}, expected hub or {known}")
+    if interface == "socketcan" and (reason := socketcan_reason(channel)):
+        raise BusError(f"bus {name!r}: {reason}")
+    return BusChoice(interface, channel, "asked for")
+
+
+def _best_bus() -> BusChoice:
+    no_vcan0 = socketcan_reason(DEFAULT_CHANNEL)
+    if not no_vcan0:
+        return BusChoice("socketcan", DEFAULT_CHANNEL, f"{DEFAULT_CHANNEL} exists")
+    no_private_vcan = private_vcan_reason()
+    reasons = dict.fromkeys((no_vcan0, no_private_vcan))
+    return BusChoice(_HUB_INTERFACE, DEFAULT_CHANNEL, "; ".join(reasons))
+
+
+def socketcan_reason(channel: str) -> str:
+    """Why the network interface `channel` is no CAN bus here; empty when it is one."""
+    if not hasattr(socket, "AF_CAN"):
+        return "this system has no SocketCAN"
+    try:
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
+            probe.bind((channel,))
+            # An interface that is down can be bound, the error is only noted.
+            error = probe.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+    except OSError as refused:
+        if refused.errno is None:  # the name is longer than that of any interface
+            return f"network interface {channel!r}: {refused}"
+        error = refused.errno
+    if error == errno.EAFNOSUPPORT:
+        return "this kernel has no SocketCAN"
+    if error == errno.ENODEV:
+        return f"there is no network interface {channel!r} for CAN"
+    if error == errno.ENETDOWN:
+        return f"network interface {channel!r} is down, try: sudo ip link set up {channel}"
+    return f"network interface {channel!r}: {os.strerror(error)}" if error else ""
+
+
+def private_vcan_reason() -> str:
+    """Why this machine cannot have a private vcan."""
+    # The address family alone says enough: interface 0, all of them, can be bound everywhere.
+    if reason := socketcan_reason(""):
+        return reason
+    release = Path("/lib/modules", os.uname().release)
+    lists = [release / "modules.dep", release / "modules.builtin"]
+    known = any(each.exists() and "/vcan.ko" in each.read_text() for each in lists)
+    if not known and not Path("/sys/module/vcan").exists():
+        return "this kernel has no module vcan"
+    return "this version makes no network namespace for its nodes"
+
+
+def _enlarge_receive_buffer(bus: Any) -> None:
+    """Let a node that was not scheduled for a while find all frames of that time."""
+    try:
+        bus.socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER_BYTES)
+    except OSError:  # only root may go beyond net.core.rmem_max
+        bus.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+
+
+def send_frames(bus: can.BusABC, frames: Sequence[tuple[int, int]]) -> None:
+    """Transmit mailbox frames, at once where the bus can.
+
+    :raises can.CanError: the bus does not take them.
+    """
+    fast = getattr(bus, "send_frames", None)
+    if fast is not None:
+        fast(frames)
+        return
+    for can_id, payload in frames:
+        data = payload.to_bytes(8, "little", signed=True)
+        message = can.Message(arbitration_id=can_id, is_extended_id=False, data=data)
+        bus.send(message, _SEND_TIMEOUT_S)
+
+
+def recv_frames(bus: can.BusABC, timeout: float | None) -> list[tuple[int, int]]:
+    """Receive the mailbox frames that have come, or wait for the first.
+
+    :param timeout: seconds to wait; None waits for ever.
+    :return: what came, at most some thousand frames; empty when nothing did. Frames that are not
+        standard data frames of 8 bytes have `FOREIGN` set in their identifier, the rest of which
+        is that of Linux (identifier, extended, remote and error flag).
+    :raises can.CanError: the bus is gone.
+    """
+    fast = getattr(bus, "recv_frames", None)
+    if fast is not None:
+        frames: list[tuple[int, int]] = fast(timeout)
+        return frames
+    frames = []
+    message = bus.recv(timeout)
+    while message is not None:
+        frames.append(_mailbox_frame(message))
+        message = bus.recv(0) if len(frames) < _MAX_FRAMES else None
+    return frames
+
+
+def _mailbox_frame(message: can.Message) -> tuple[int, int]:
+    payload = int.from_bytes(message.data[:8].ljust(8, b"\0"), "little", signed=True)
+    word = message.arbitration_id
+    if message.is_extended_id:
+        word |= EXTENDED
+    if message.is_remote_frame:
+        word |= REMOTE
+    if message.is_error_frame:
+        word |= ERROR
+    if word >= 0x800 or message.is_fd or message.dlc != 8:
+        word |= FOREIGN
+    return word, payload

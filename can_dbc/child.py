@@ -1,0 +1,45 @@
+"""What the node processes share: they end with their parent, and they speak to it in JSON lines."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+
+class Stop:
+    """Set by SIGTERM, or when the parent's end of stdin is closed: the node ends after the current tick."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        signal.signal(signal.SIGTERM, self._request)
+        # Ctrl-C is the parent's to handle; it ends its nodes in order.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def _request(self, *_: Any) -> None:
+        self.requested = True
+
+
+def follow_parent(on_command: Callable[[dict[str, Any]], None] | None = None) -> None:
+    """Reads commands, one JSON object a line, from stdin in a thread; the end of stdin ends this process."""
+
+    def read() -> None:
+        for line in sys.stdin:
+            if on_command is not None and line.strip():
+                on_command(json.loads(line))
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=read, daemon=True, name="parent").start()
+
+
+def tell(event: str, **fields: Any) -> None:
+    """One event to the parent, as a JSON line on stdout; a parent that is gone is no error here."""
+    try:
+        sys.stdout.write(json.dumps({"event": event, **fields}) + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.kill(os.getpid(), signal.SIGTERM)

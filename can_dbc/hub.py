@@ -1,0 +1,450 @@
+"""The embedded CAN bus as a python-can interface: `can.Bus(interface="atohub", channel="vcan0")`.
+
+The processes of one user that open the same channel exchange frames with the semantics of a Linux
+vcan interface, where the kernel has none. The first node starts the hub process
+(`can_dbc.hub_server`, which also describes the protocol), the last one to leave ends it.
+
+The sockets live in a directory that only its owner can enter: `$XDG_RUNTIME_DIR/ato-hil`, else
+`ato-hil-UID` in the folder for temporary files. A lock on that directory makes the election of a
+hub free of races, so that no lock files are needed.
+"""
+
+import contextlib
+import fcntl
+import json
+import logging
+import os
+import re
+import select
+import socket
+import stat
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+from can.typechecking import CanFilters
+
+from can_dbc import hub_server
+from can_dbc.hub_server import (
+    BITRATE_SWITCH,
+    ERROR,
+    ERROR_STATE,
+    EXTENDED,
+    FD_FRAME,
+    FD_FRAME_STRUCT,
+    FRAME,
+    OVERRUN,
+    OWN,
+    PROTOCOL,
+    REMOTE,
+    STAMP,
+)
+
+DEFAULT_CHANNEL = "vcan0"
+
+#: Set in the identifiers that `recv_frames` gives to all but standard data frames of 8 bytes.
+FOREIGN = 1 << 32
+
+_LOG = logging.getLogger(__name__)
+
+_READ_BYTES = 1 << 16
+_CONNECT_TIMEOUT_S = 10.0  # many nodes that start at once on a loaded machine take half a second
+_MAX_PATH_BYTES = 103  # sockaddr_un holds 104 bytes on macOS, 108 on Linux, with the final zero
+
+# A frame of `send_frames` and `recv_frames`: identifier, length and flags as one word, then the
+# payload as one signed word. A standard data frame of 8 bytes is (identifier | _MAILBOX, payload).
+_SENT_WORDS = {False: struct.Struct("<Qq"), True: struct.Struct("<Qq56x")}
+_RECEIVED_WORDS = {False: struct.Struct("<8xQq"), True: struct.Struct("<8xQq56x")}
+_MAILBOX = 8 << 32
+_STANDARD_IDS = 0x800
+_FLAGS_SHIFT = 40  # of the flags in the first word
+
+
+class HubBus(can.BusABC):
+    """A node on the embedded bus.
+
+    Messages carry the time at which the hub took them. A node that reads too slowly loses frames
+    beyond the hub's queue for it: their number is added to `frames_lost`, a warning is logged, and
+    `recv` returns an error frame (controller problem, receive overflow) in their place.
+
+    Sending and receiving may happen in two threads. `set_filters` may be called while another
+    thread receives; what is sent after it returned passes the new filters.
+    """
+
+    def __init__(
+        self,
+        channel: can.typechecking.Channel = DEFAULT_CHANNEL,
+        can_filters: CanFilters | None = None,
+        receive_own_messages: bool = False,
+        fd: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        """Connect to the hub of `channel`, starting it if there is none.
+
+        Every frame that is sent after this returns reaches this node.
+
+        :param channel: letters, digits, `_`, `.` and `-`.
+        :param receive_own_messages: whether to receive what this node sends.
+        :param fd: whether to send and receive CAN FD frames.
+        :raises ValueError: the channel is not a possible name.
+        :raises can.CanInitializationError: there is no hub and none can be started.
+        """
+        self.channel = str(channel)
+        self.channel_info = f"atohub channel '{self.channel}'"
+        self.frames_lost = 0
+        self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+        self._fd = fd
+        self._frame = FD_FRAME_STRUCT if fd else FRAME
+        self._frame_words, self._stamped_words = _SENT_WORDS[fd], _RECEIVED_WORDS[fd]
+        self._stamped_size = STAMP.size + self._frame.size
+        self._hub_filters = _filter_words(can_filters)
+        self._path = socket_path(self.channel)
+        request = {"fd": fd, "own": receive_own_messages, "filters": self._hub_filters}
+        self._socket, answer, self._received = _join(self._path, request)
+        self._number: int = answer["node"]
+        #: Process of the hub.
+        self.hub_pid: int = answer["pid"]
+        self._position = 0  # in _received, of the next frame
+        self._timeout: float | None = None  # that the socket is set to
+        self._send_lock = threading.Lock()
+        self._hub_is_gone = False
+        super().__init__(channel=channel, can_filters=can_filters, **kwargs)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Transmit a message.
+
+        :param timeout: how many seconds to wait for the hub to take it; None waits for ever.
+        :raises ValueError: the message does not fit into a frame of this bus.
+        :raises can.CanOperationError: the hub is gone, or did not take it in time.
+        """
+        word, flags = msg.arbitration_id, 0
+        if msg.is_extended_id:
+            word |= EXTENDED
+        if msg.is_remote_frame:
+            word |= REMOTE
+        if msg.is_error_frame:
+            word |= ERROR
+        if msg.is_fd:
+            flags |= FD_FRAME
+            if msg.bitrate_switch:
+                flags |= BITRATE_SWITCH
+            if msg.error_state_indicator:
+                flags |= ERROR_STATE
+        if msg.is_fd and not self._fd:
+            raise ValueError(f"{self.channel_info}: a CAN FD message on a bus opened without fd")
+        if msg.dlc > (64 if msg.is_fd else 8):
+            raise ValueError(f"{self.channel_info}: a message of {msg.dlc} bytes is too long")
+        self._transmit(self._frame.pack(word, msg.dlc, flags, msg.data), timeout)
+
+    def send_frames(self, frames: list[tuple[int, int]]) -> None:
+        """Transmit standard data frames of 8 bytes with one system call.
+
+        :param frames: identifier, and the payload as a little-endian signed 64-bit integer.
+        :raises can.CanOperationError: the hub is gone.
+        """
+        pack = self._frame_words.pack
+        self._transmit(b"".join([pack(can_id | _MAILBOX, payload) for can_id, payload in frames]))
+
+    def recv_frames(self, timeout: float | None = None) -> list[tuple[int, int]]:
+        """Receive all frames that have come, or wait for the first.
+
+        :param timeout: how many seconds to wait; None waits for ever.
+        :return: identifier, and the payload as a little-endian signed 64-bit integer. What is not
+            a standard data frame of 8 bytes has `FOREIGN` set in its identifier (extended, remote,
+            error and FD frames, other lengths). Empty when nothing came.
+        :raises can.CanOperationError: the hub is gone.
+        """
+        if not self._fill(timeout):
+            return []
+        frames = []
+        start = self._position
+        end = len(self._received) - (len(self._received) - start) % self._stamped_size
+        for word, payload in self._stamped_words.iter_unpack(self._received[start:end]):
+            can_id = word ^ _MAILBOX
+            if can_id >= _STANDARD_IDS:
+                can_id = self._unusual_identifier(word, payload)
+            frames.append((can_id, payload))
+        self._position = end
+        return frames
+
+    def fileno(self) -> int:
+        """Return -1: frames that wait in this process would not make a descriptor readable."""
+        return -1
+
+    def shutdown(self) -> None:
+        """Leave the bus."""
+        if self._is_shutdown:
+            return
+        super().shutdown()
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that still receives
+        self._socket.close()
+        if self._hub_is_gone:
+            with contextlib.suppress(OSError), _directory_lock(self._path.parent):
+                _remove_stale_socket(self._path)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._fill(timeout):
+            return None, True
+        start = self._position
+        self._position = start + self._stamped_size
+        (stamp_ns,) = STAMP.unpack_from(self._received, start)
+        word, length, flags, data = self._frame.unpack_from(self._received, start + STAMP.size)
+        if flags & OVERRUN:
+            self._count_lost(int.from_bytes(data[4:8], "little"))
+        extended = bool(word & EXTENDED)
+        message = can.Message(
+            timestamp=stamp_ns * 1e-9,
+            arbitration_id=word & (0x1FFF_FFFF if extended else 0x7FF),
+            is_extended_id=extended,
+            is_remote_frame=bool(word & REMOTE),
+            is_error_frame=bool(word & ERROR),
+            channel=self.channel,
+            dlc=length,
+            data=data[:length],
+            is_fd=bool(flags & FD_FRAME),
+            is_rx=not flags & OWN,
+            bitrate_switch=bool(flags & BITRATE_SWITCH),
+            error_state_indicator=bool(flags & ERROR_STATE),
+        )
+        return message, True
+
+    def _apply_filters(self, filters: CanFilters | None) -> None:
+        words = _filter_words(filters)
+        if words == self._hub_filters:
+            return
+        # On a connection of its own, because a thread may be reading from the other one.
+        request = {"node": self._number, "filters": words}
+        try:
+            connection, _, _ = _ask(self._path, request)
+        except OSError as error:
+            raise self._gone(error) from error
+        connection.close()
+        self._hub_filters = words
+
+    def _transmit(self, data: bytes, timeout: float | None = None) -> None:
+        """Hand frames over to the hub."""
+        with self._send_lock:
+            if timeout is not None and not _writable(self._socket, timeout):
+                raise can.CanOperationError(f"{self.channel_info}: the hub takes no frames")
+            try:
+                self._socket.sendall(data)
+            except OSError as error:
+                raise self._gone(error) from error
+
+    def _fill(self, timeout: float | None) -> bool:
+        """Make sure that a whole frame has been received; False when none came in time."""
+        while len(self._received) - self._position < self._stamped_size:
+            try:
+                if timeout is not None and timeout <= 0:
+                    chunk = self._socket.recv(_READ_BYTES, socket.MSG_DONTWAIT)
+                else:
+                    if timeout != self._timeout:
+                        self._set_timeout(timeout)
+                    chunk = self._socket.recv(_READ_BYTES)
+            except BlockingIOError:
+                return False
+            except OSError as error:
+                raise self._gone(error) from error
+            if not chunk:
+                raise self._gone(None)
+            self._received = self._received[self._position :] + chunk
+            self._position = 0
+        return True
+
+    def _set_timeout(self, timeout: float | None) -> None:
+        # The kernel's own time limit: waiting and reading are one system call instead of two.
+        microseconds = 0 if timeout is None else max(1, round(timeout * 1e6))
+        limit = struct.pack("@ll", *divmod(microseconds, 1_000_000))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+        self._timeout = timeout
+
+    def _unusual_identifier(self, word: int, payload: int) -> int:
+        """Identifier that `recv_frames` gives to a frame that is not plainly one of its own."""
+        flags = word >> _FLAGS_SHIFT
+        if flags & OVERRUN:
+            self._count_lost((payload >> 32) & 0xFFFF_FFFF)
+        if flags == OWN:
+            word ^= OWN << _FLAGS_SHIFT
+        can_id = word ^ _MAILBOX
+        return can_id if can_id < _STANDARD_IDS else FOREIGN | (word & 0xFFFF_FFFF)
+
+    def _count_lost(self, frames: int) -> None:
+        self.frames_lost += frames
+        _LOG.warning("%s: read too slowly, the hub dropped %d frames", self.channel_info, frames)
+
+    def _gone(self, error: OSError | None) -> can.CanOperationError:
+        if self._is_shutdown:
+            return can.CanOperationError(f"{self.channel_info}: the bus is shut down")
+        self._hub_is_gone = True
+        reason = f": {error.strerror or error}" if error else ""
+        return can.CanOperationError(
+            f"{self.channel_info}: the hub (process {self.hub_pid}) is gone{reason}"
+        )
+
+
+def socket_path(channel: str) -> Path:
+    """The socket of a channel; makes the directory that it is in.
+
+    :raises ValueError: the channel is not a possible name.
+    :raises can.CanInitializationError: the directory belongs to somebody else or is open to
+        others, or its path is too long for a socket.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_.-]+", channel):
+        raise ValueError(f"atohub: channel {channel!r}: expected letters, digits, '_', '.' and '-'")
+    path = _socket_directory() / f"{channel}.v{PROTOCOL}.sock"
+    if len(os.fsencode(path)) > _MAX_PATH_BYTES:
+        raise can.CanInitializationError(
+            f"atohub: socket path {path} is longer than {_MAX_PATH_BYTES} bytes: "
+            "set XDG_RUNTIME_DIR or TMPDIR to a shorter directory, or shorten the channel"
+        )
+    return path
+
+
+def _socket_directory() -> Path:
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    if os.path.isabs(runtime) and os.path.isdir(runtime):
+        directory = Path(runtime, "ato-hil")
+    else:
+        directory = Path(tempfile.gettempdir(), f"ato-hil-{os.getuid()}")
+    try:
+        with contextlib.suppress(FileExistsError):
+            directory.mkdir(mode=0o700)
+        status = directory.lstat()  # a link into a directory of ours could be anybody's
+    except OSError as error:
+        raise can.CanInitializationError(f"atohub: {directory}: {error.strerror}") from error
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
+        raise can.CanInitializationError(
+            f"atohub: {directory}: expected a directory of user {os.getuid()} with mode 0700"
+        )
+    return directory
+
+
+def _filter_words(filters: CanFilters | None) -> list[tuple[int, int]]:
+    """Filters of python-can as pairs of identifier word and mask."""
+    words = []
+    for each in filters or ():
+        can_id, mask = each["can_id"] & 0x1FFF_FFFF, each["can_mask"] & 0x1FFF_FFFF
+        if "extended" in each:
+            mask |= EXTENDED
+            can_id |= EXTENDED if each["extended"] else 0
+        words.append((can_id, mask))
+    return words
+
+
+def _join(path: Path, request: dict[str, Any]) -> tuple[socket.socket, dict[str, int], bytes]:
+    """Connect to the hub as a node, starting a hub if there is none; returns as `_ask`."""
+    deadline = time.monotonic() + _CONNECT_TIMEOUT_S
+    while True:
+        try:
+            try:
+                return _ask(path, request)
+            except (FileNotFoundError, ConnectionRefusedError):
+                _start_hub(path)
+        except ConnectionError as error:
+            # It was just leaving: try again.
+            if time.monotonic() > deadline:
+                raise can.CanInitializationError(f"atohub: the hub at {path} hangs up") from error
+        except TimeoutError as error:
+            raise can.CanInitializationError(
+                f"atohub: the hub at {path} does not answer within {_CONNECT_TIMEOUT_S:g} s"
+            ) from error
+        except OSError as error:
+            raise can.CanInitializationError(f"atohub: {path}: {error.strerror}") from error
+
+
+def _ask(path: Path, request: dict[str, Any]) -> tuple[socket.socket, dict[str, int], bytes]:
+    """Open a connection with a request; returns it, the answer, and what came after the answer."""
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        connection.settimeout(_CONNECT_TIMEOUT_S)
+        connection.connect(os.fspath(path))
+        connection.sendall(json.dumps(request).encode() + b"\n")
+        received = b""
+        while b"\n" not in received:
+            chunk = connection.recv(_READ_BYTES)
+            if not chunk:
+                raise ConnectionResetError("closed before the answer")
+            received += chunk
+        connection.settimeout(None)
+    except BaseException:
+        connection.close()
+        raise
+    answer, _, rest = received.partition(b"\n")
+    return connection, json.loads(answer), rest
+
+
+def _start_hub(path: Path) -> None:
+    """Start the hub of a channel, unless somebody else just did.
+
+    The socket listens before the process runs: whoever connects meanwhile only waits.
+    """
+    with _directory_lock(path.parent):
+        if not _remove_stale_socket(path):
+            return
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            listener.bind(os.fspath(path))
+            path.chmod(0o600)
+            listener.listen(128)
+            # Its own session, so that Ctrl-C in a terminal does not reach it. It forks and lets
+            # this process go on, so there is no child to wait for later. By file name and without
+            # site packages, because that starts faster and works from any directory.
+            command = [sys.executable, "-I", "-S", hub_server.__file__, os.fspath(path)]
+            done = subprocess.run(
+                command,
+                stdin=listener.fileno(),
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                start_new_session=True,
+                check=False,
+            )
+        except OSError as error:
+            path.unlink(missing_ok=True)
+            raise can.CanInitializationError(f"atohub: cannot start a hub: {error}") from error
+        finally:
+            listener.close()
+        if done.returncode:
+            path.unlink(missing_ok=True)
+            lines = done.stderr.decode(errors="replace").strip().splitlines()
+            reason = lines[-1] if lines else f"exit code {done.returncode}"
+            raise can.CanInitializationError(f"atohub: cannot start a hub: {reason}")
+
+
+def _remove_stale_socket(path: Path) -> bool:
+    """Delete a socket that nobody listens to; False when a hub does. Needs the directory's lock."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(_CONNECT_TIMEOUT_S)
+        try:
+            probe.connect(os.fspath(path))
+        except (FileNotFoundError, ConnectionRefusedError):
+            path.unlink(missing_ok=True)
+            return True
+        except OSError:
+            return False  # connecting again tells the user what is wrong
+    return False
+
+
+@contextlib.contextmanager
+def _directory_lock(directory: Path) -> Iterator[None]:
+    """Hold the lock under which hubs come and go; it vanishes with the process that holds it."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _writable(connection: socket.socket, timeout: float) -> bool:
+    """Whether the socket takes data within `timeout` seconds."""
+    poll = select.poll()
+    poll.register(connection, select.POLLOUT)
+    return bool(poll.poll(max(0.0, timeout) * 1000))

@@ -1,0 +1,128 @@
+"""`@step`: the one decorator of all code that runs as firmware or inside the cyclic loop.
+
+A step is compiled without the Python runtime: `_nrt=False` makes the compiler refuse whatever would allocate, so the
+allocation-free property is proved each time that a step compiles. The undecorated source runs in plain Python when
+ATO_HIL_INTERPRETED=1 is set before the import (the MIL mode): `int64` is then `Checked`, an integer that raises on the
+first value outside 64 bits, and a store outside its field's range raises OverflowError.
+
+The compiler's cache is keyed by the sources of all four packages and the DBC, because numba itself sees an edit of the
+compiled file only, not of what that file imports.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import os
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numba
+
+INTERPRETED = os.environ.get("ATO_HIL_INTERPRETED") == "1"
+PACKAGES = ("can_dbc", "controller", "plant_sim", "tools")
+
+_INT64_MIN = -(2**63)
+_INT64_MAX = 2**63 - 1
+
+
+class Checked(int):
+    """An integer that stays inside 64 bits or raises OverflowError; what `int64` is in interpreted steps."""
+
+    def __new__(cls, value: int) -> Checked:
+        result = super().__new__(cls, value)
+        if not _INT64_MIN <= result <= _INT64_MAX:
+            raise OverflowError(f"intermediate {int(result)} is outside 64 bits")
+        return result
+
+
+def _checked_operator(name: str) -> Any:
+    operation = getattr(int, name)
+
+    def apply(self: int, other: Any) -> Any:
+        result = operation(self, int(other))
+        return result if result is NotImplemented else Checked(result)
+
+    return apply
+
+
+for _name in ("add", "sub", "mul", "and", "or", "xor", "lshift", "rshift"):
+    setattr(Checked, f"__{_name}__", _checked_operator(f"__{_name}__"))
+    setattr(Checked, f"__r{_name}__", _checked_operator(f"__r{_name}__"))
+for _name in ("neg", "abs", "invert"):
+    _unary = getattr(int, f"__{_name}__")
+    setattr(Checked, f"__{_name}__", lambda self, _unary=_unary: Checked(_unary(self)))
+
+
+def _checked_division(name: str) -> Any:
+    operation = getattr(int, name)
+
+    def apply(self: int, other: Any) -> Checked:
+        # The compiled steps define x // 0 == 0 and x % 0 == 0.
+        divisor = other if name.startswith("__r") is False else self
+        return Checked(0) if int(divisor) == 0 else Checked(operation(self, int(other)))
+
+    return apply
+
+
+for _name in ("floordiv", "mod"):
+    setattr(Checked, f"__{_name}__", _checked_division(f"__{_name}__"))
+    setattr(Checked, f"__r{_name}__", _checked_division(f"__r{_name}__"))
+
+int64: Any = Checked if INTERPRETED else numba.int64
+
+
+def dbc_path() -> Path:
+    """The DBC in force: the packaged one, or the file that ATO_HIL_DBC names."""
+    override = os.environ.get("ATO_HIL_DBC")
+    return Path(override) if override else Path(__file__).with_name("ato.dbc")
+
+
+@lru_cache(maxsize=None)
+def _file_digest(path: str) -> str:
+    try:
+        return hashlib.blake2b(Path(path).read_bytes(), digest_size=12).hexdigest()
+    except OSError:
+        return "unreadable"
+
+
+@lru_cache(maxsize=1)
+def source_digest() -> str:
+    """Digest of every source that compiled code can depend on: the four packages, the DBC, the compiler."""
+    root = Path(__file__).resolve().parent.parent
+    files = sorted(path for package in PACKAGES for path in (root / package).rglob("*.py"))
+    parts = [f"{path.relative_to(root)}:{_file_digest(str(path))}" for path in files]
+    parts.append(_file_digest(str(dbc_path())))
+    parts.append(numba.__version__)
+    return hashlib.blake2b("\n".join(parts).encode(), digest_size=12).hexdigest()
+
+
+def cache_directory() -> Path:
+    """Where compiled steps are kept: NUMBA_CACHE_DIR, else a folder a source digest in the user's cache."""
+    configured = os.environ.get("NUMBA_CACHE_DIR")
+    if configured:
+        return Path(configured)
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "ato-hil" / source_digest()
+
+
+def _stable_identity(function: Any) -> str:
+    """A name that is equal in every process: numba's own is random, and closures over steps would miss the cache."""
+    source = inspect.getsourcefile(function) or ""
+    parts = [function.__module__, function.__qualname__, _file_digest(source)]
+    for cell in function.__closure__ or ():
+        parts.append(str(getattr(cell.cell_contents, "_uuid", cell.cell_contents)))
+    return hashlib.blake2b("|".join(parts).encode(), digest_size=16).hexdigest()
+
+
+def step(function: Any) -> Any:
+    """Compile `function` as an allocation-free step; in interpreted mode return it as it is."""
+    if INTERPRETED:
+        return function
+    numba.config.CACHE_DIR = str(cache_directory())
+    compiled = numba.njit(
+        nogil=True, error_model="numpy", cache=True, boundscheck=False, _nrt=False
+    )(function)
+    compiled._set_uuid(_stable_identity(function))
+    return compiled

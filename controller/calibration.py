@@ -1,0 +1,179 @@
+"""Calibration: the SI numbers of a scenario become the integer parameters of the firmware, and a file that is flashed.
+
+The only float code of the firmware, together with `calibrate` of each law. A calibration file holds the law's name, the
+bytes of PARAMS and of the reference profile, and the scenario's digest; the controller process needs nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from controller import distribution, firmware, memory, reference
+from controller.q import Q_FORCE
+from controller.quantise import CalibrationError, Vehicle, fixed
+from controller.registry import law_number, load_law
+
+FORMAT = "ato-hil calibration 1"
+
+
+class MemorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Grid of the learning memory."""
+
+    decimation: int = 1  # control periods a cell
+    lead_ticks: int = 0
+    interpolation: str = "hold"  # hold | linear
+    storage: str = "int32"  # int32 | int16
+
+
+class GuardSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the guard tolerates and how it brakes."""
+
+    age_max_ticks: int = 10
+    service_brake_m_s2: float = 0.8
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a controller is flashed with."""
+
+    law: str
+    scenario_digest: str
+    params: np.ndarray  # (1,) of firmware.params_dtype
+    profile: np.ndarray  # (segments,) of reference.SEGMENT
+    memory_dtype: str  # int32 | int16
+
+
+def calibrate(
+    *,
+    law: str,
+    gains: dict[str, Any],
+    vehicle: Vehicle,
+    profile: np.ndarray,
+    preview_ticks: int,
+    memory_settings: MemorySettings,
+    guard_settings: GuardSettings,
+    car_effectiveness: list[float],
+    motor_cars: list[int],
+    scenario_digest: str,
+) -> Calibration:
+    """PARAMS of the firmware for one law on one scenario. Raises CalibrationError or LawError with one line."""
+    module = load_law(law)
+    try:
+        typed = msgspec.convert(gains, module.Gains, strict=False)
+    except msgspec.ValidationError as error:
+        raise CalibrationError(f"laws.{law}: {error}") from None
+    params = np.zeros(1, firmware.params_dtype(module.PARAMS))
+    try:
+        params["law"] = module.calibrate(typed, vehicle)
+        params["core"] = _core(module, law, vehicle)
+        params["guard"]["age_max"] = guard_settings.age_max_ticks
+        params["guard"]["control_age_max"] = guard_settings.age_max_ticks + 20
+        params["guard"]["service_brake"] = fixed(
+            "guard.service_brake_m_s2", -abs(guard_settings.service_brake_m_s2), 27
+        )
+        params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
+        ticks = int(profile["ticks"].sum()) + 1
+        params["memory"] = _memory(module, typed, vehicle, memory_settings, ticks)
+    except CalibrationError as error:
+        raise CalibrationError(f"laws.{law}: {error}") from None
+    if car_effectiveness:
+        params["distribution"] = distribution.calibrate(car_effectiveness, motor_cars)
+    return Calibration(law, scenario_digest, params, profile, memory_settings.storage)
+
+
+def _core(module: Any, law: str, vehicle: Vehicle) -> np.ndarray:
+    core = np.zeros(1, firmware.CORE_PARAMS)
+    core["mass"] = fixed("mass_kg", vehicle.mass_kg, Q_FORCE)
+    core["law"] = law_number(law)
+    core["estimates"] = len(module.ESTIMATES)
+    for index, (_name, _unit, q) in enumerate(module.ESTIMATES):
+        core["exponent"][0, index] = q
+    return core
+
+
+def _reference(period_s: float, profile: np.ndarray, preview_ticks: int) -> np.ndarray:
+    params = np.zeros(1, reference.REFERENCE_PARAMS)
+    speed, acceleration = 3 / period_s, 6 / period_s**2
+    if abs(speed - round(speed)) > 1e-6 or abs(acceleration - round(acceleration)) > 1e-3:
+        raise CalibrationError(f"control period {period_s:g} s must divide 1 s")
+    if not 0 <= preview_ticks <= reference.PREVIEW_MAX:
+        raise CalibrationError(
+            f"preview of {preview_ticks} ticks, expected 0 to {reference.PREVIEW_MAX}"
+        )
+    params["speed_factor"] = round(speed)
+    params["acceleration_factor"] = round(acceleration)
+    params["segment_count"] = len(profile)
+    params["preview"] = preview_ticks
+    return params
+
+
+def _memory(
+    module: Any, gains: Any, vehicle: Vehicle, settings: MemorySettings, ticks: int
+) -> np.ndarray:
+    params = np.zeros(1, memory.MEMORY_PARAMS)
+    words = len(module.WORDS)
+    if words == 0:
+        return params
+    if settings.decimation < 1:
+        raise CalibrationError(f"memory.decimation is {settings.decimation}, expected 1 or more")
+    if settings.interpolation not in ("hold", "linear"):
+        raise CalibrationError(f"memory.interpolation is {settings.interpolation!r}, expected hold or linear")
+    if settings.storage not in ("int32", "int16"):
+        raise CalibrationError(f"memory.storage is {settings.storage!r}, expected int32 or int16")
+    initial, low, high = module.learned(gains, vehicle)
+    params["words"] = words
+    params["cells"] = -(-ticks // settings.decimation)
+    params["decimation"] = settings.decimation
+    params["lead"] = settings.lead_ticks
+    params["linear"] = int(settings.interpolation == "linear")
+    params["weight"] = round(2**30 / (2 * settings.decimation))
+    params["scale"] = 1 if settings.storage == "int32" else 2**16
+    params["initial"][0, :words] = initial
+    params["low"][0, :words] = low
+    params["high"][0, :words] = high
+    return params
+
+
+def save(calibration: Calibration, path: Path) -> None:
+    """Writes the calibration file."""
+    head = {
+        "format": FORMAT,
+        "law": calibration.law,
+        "scenario_digest": calibration.scenario_digest,
+        "memory_dtype": calibration.memory_dtype,
+    }
+    np.savez(
+        path,
+        head=np.frombuffer(json.dumps(head).encode(), np.uint8),
+        params=np.frombuffer(calibration.params.tobytes(), np.uint8),
+        profile=np.frombuffer(calibration.profile.tobytes(), np.uint8),
+    )
+
+
+def load(path: Path) -> Calibration:
+    """Reads a calibration file. Raises CalibrationError if it is none or is for another build of the law."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            head = json.loads(archive["head"].tobytes())
+            params_bytes = archive["params"].tobytes()
+            profile_bytes = archive["profile"].tobytes()
+    except (OSError, ValueError, KeyError) as error:
+        raise CalibrationError(f"{path}: not a calibration file ({error})") from None
+    if head.get("format") != FORMAT:
+        raise CalibrationError(f"{path}: format {head.get('format')!r}, expected {FORMAT!r}")
+    dtype = firmware.params_dtype(load_law(head["law"]).PARAMS)
+    if len(params_bytes) != dtype.itemsize:
+        raise CalibrationError(f"{path}: made for another build of law {head['law']!r}")
+    return Calibration(
+        head["law"],
+        head["scenario_digest"],
+        np.frombuffer(params_bytes, dtype).copy(),
+        np.frombuffer(profile_bytes, reference.SEGMENT).copy(),
+        head["memory_dtype"],
+    )

@@ -1,0 +1,399 @@
+"""The cyclic task: mailboxes in, mailboxes out, once a control period.
+
+Contract of `tick(params, profile, state, memory, rx, tx)`: a step. It reads `rx` (mailboxes, cleared by the caller after the
+tick), `params`, `profile`; writes `state`, `memory`, `tx`; takes bounded time; never raises, whatever is in the mailboxes.
+In order: decode and end-to-end check, ages, the onboard reference, the law, the guard, distribution over the cars, encode
+and protect. The process around it moves payloads and stores the learning memory, nothing else.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from can_dbc import e2e
+from can_dbc.codec import (
+    ATO_ESTIMATE,
+    ATO_STATUS,
+    ATO_TRACKING,
+    ATP_LIMIT,
+    CAR_FORCE_1,
+    CAR_FORCE_2,
+    CAR_FORCE_3,
+    CAR_FORCE_4,
+    FORCE_CMD,
+    MESSAGE_COUNT,
+    RUN_CTRL,
+    TRAIN_POSITION,
+    TRAIN_SPEED,
+    binary_exponent,
+    get,
+    put,
+    saturate,
+)
+from can_dbc.step import int64, step
+from controller import distribution, guard, memory, reference
+from controller.interface import (
+    ARMED,
+    BRAKE,
+    COAST,
+    ESTIMATES_MAX,
+    FAULT_TICK,
+    GUARD_NORMAL,
+    INPUTS,
+    OUTPUTS,
+    RUNNING,
+    TRACTION,
+)
+from controller.q import (
+    Q_ACCELERATION,
+    Q_FORCE,
+    Q_POSITION,
+    Q_SPEED,
+    round_shift,
+    sat32,
+)
+
+STATUS_PERIOD = 10  # ticks between ATO_STATUS frames
+TICK_MASK = 0xFFFF
+
+# From raw signals to the firmware's formats; the scales are the DBC's.
+_SPEED_SHIFT = Q_SPEED - binary_exponent(TRAIN_SPEED, "Speed")
+_POSITION_SHIFT = Q_POSITION - binary_exponent(TRAIN_POSITION, "Position")
+_FORCE_SHIFT = Q_FORCE - binary_exponent(FORCE_CMD, "Force")
+_POSITION_ERROR_SHIFT = Q_POSITION - binary_exponent(ATO_TRACKING, "PositionError")
+_SPEED_ERROR_SHIFT = Q_SPEED - binary_exponent(ATO_TRACKING, "SpeedError")
+_PERMITTED_FACTOR = round(ATP_LIMIT.PermittedSpeed.scale * 2**Q_SPEED)
+
+LINK = np.dtype(
+    [
+        ("counter", np.int32),  # of the last good frame received, -1: none yet
+        ("age", np.int32),  # ticks since then
+        ("lost", np.int32),  # frames refused or missed in this run
+        ("padding", np.int32),
+    ],
+    align=True,
+)
+
+CORE_PARAMS = np.dtype(
+    [
+        ("mass", np.int32),  # kg, Q4
+        ("law", np.int32),  # number of the law, as in ATO_STATUS
+        ("estimates", np.int32),  # estimates that the law has
+        ("padding", np.int32),
+        ("exponent", np.int32, (ESTIMATES_MAX,)),  # their Q formats
+    ],
+    align=True,
+)
+
+CORE_STATE = np.dtype(
+    [
+        ("run_state", np.int32),
+        ("iteration", np.int32),
+        ("tick", np.int32),  # control periods since the start of the run
+        ("faults", np.int32),  # latched until the next run
+        ("guard", np.int32),
+        ("force", np.int32),  # total force sent, N Q4
+        ("permitted_speed", np.int32),  # Q24
+        ("supervision", np.int32),
+        ("quality", np.int32),
+        ("padding", np.int32),
+        ("car_force", np.int32, (distribution.CARS_MAX,)),  # N Q4
+        ("sent", np.int32, (MESSAGE_COUNT,)),  # next end-to-end counter of each message sent
+    ],
+    align=True,
+)
+
+
+def params_dtype(law_params: np.dtype) -> np.dtype:
+    """PARAMS of the whole firmware around those of a law."""
+    return np.dtype(
+        [
+            ("core", CORE_PARAMS),
+            ("guard", guard.PARAMS),
+            ("reference", reference.REFERENCE_PARAMS),
+            ("memory", memory.MEMORY_PARAMS),
+            ("distribution", distribution.PARAMS),
+            ("law", law_params),
+        ],
+        align=True,
+    )
+
+
+def state_dtype(law_state: np.dtype) -> np.dtype:
+    """STATE of the whole firmware around that of a law."""
+    return np.dtype(
+        [
+            ("core", CORE_STATE),
+            ("links", LINK, (MESSAGE_COUNT,)),
+            ("cursor", reference.CURSOR),
+            ("ahead", reference.CURSOR),
+            ("memory", memory.MEMORY_STATE),
+            ("cell", memory.CELL),
+            ("inputs", INPUTS),
+            ("outputs", OUTPUTS),
+            ("law", law_state),
+        ],
+        align=True,
+    )
+
+
+@step
+def receive(link: Any, mailbox: Any, data_id: Any) -> Any:
+    """1 if the mailbox holds a new frame that passes the end-to-end check; keeps the link's counter and age."""
+    link.age = min(int64(link.age) + 1, int64(1) << 20)
+    if int64(mailbox.fresh) == 0:
+        return int64(0)
+    word = int64(mailbox.payload)
+    found = e2e.check(word, int64(link.counter), data_id)
+    if found == e2e.CORRUPT or found == e2e.REPEATED:
+        link.lost = int64(link.lost) + 1
+        return int64(0)
+    if found == e2e.LOST:
+        link.lost = int64(link.lost) + 1
+    link.counter = (word >> 8) & 15
+    link.age = 0
+    return int64(1)
+
+
+@step
+def send(core: Any, tx: Any, message: Any, word: Any) -> None:
+    """Protects `word` and puts it into the message's mailbox."""
+    counter = int64(core.sent[message.index])
+    core.sent[message.index] = e2e.next_counter(counter)
+    tx[message.index].payload = e2e.protect(word, counter, message.data_id)
+    tx[message.index].fresh = 1
+
+
+@step
+def begin(params: Any, profile: Any, state: Any) -> None:
+    """State of a new run: reference at its start, counters at 0, no fault; the learning memory stays."""
+    core = state.core
+    core.tick = 0
+    core.faults = 0
+    core.guard = GUARD_NORMAL
+    core.force = 0
+    core.permitted_speed = 0
+    core.supervision = 0
+    core.quality = 0
+    for i in range(MESSAGE_COUNT):
+        core.sent[i] = 0
+        state.links[i].counter = -1
+        state.links[i].age = 0
+        state.links[i].lost = 0
+    reference.rewind(state.cursor, profile)
+    reference.rewind(state.ahead, profile)
+    for i in range(reference.PREVIEW_MAX):
+        if i < int64(params.reference.preview):
+            reference.advance(params.reference, state.ahead, profile)
+    memory.rewind(params.memory, state.memory)
+    state.inputs.limited = 0
+
+
+@step
+def status_word(params: Any, core: Any) -> Any:
+    """ATO_STATUS."""
+    return (
+        put(ATO_STATUS.Law, int64(params.core.law))
+        + put(ATO_STATUS.RunState, int64(core.run_state))
+        + put(ATO_STATUS.Guard, int64(core.guard))
+        + put(ATO_STATUS.Faults, int64(core.faults))
+        + put(ATO_STATUS.Iteration, int64(core.iteration))
+    )
+
+
+@step
+def tracking_word(inputs: Any) -> Any:
+    """ATO_TRACKING: errors as the controller sees them, saturated to their signals."""
+    position_error = int64(inputs.position) - int64(inputs.reference_position)
+    speed_error = int64(inputs.speed) - int64(inputs.reference_speed)
+    return put(
+        ATO_TRACKING.PositionError,
+        saturate(ATO_TRACKING.PositionError, position_error >> _POSITION_ERROR_SHIFT),
+    ) + put(
+        ATO_TRACKING.SpeedError,
+        saturate(ATO_TRACKING.SpeedError, round_shift(speed_error, _SPEED_ERROR_SHIFT)),
+    )
+
+
+@step
+def read_inputs(state: Any, rx: Any) -> None:
+    """Measurements, limit and tick from the mailboxes that pass their check; the others keep their last value."""
+    core = state.core
+    inputs = state.inputs
+    if receive(state.links[TRAIN_SPEED.index], rx[TRAIN_SPEED.index], TRAIN_SPEED.data_id):
+        word = int64(rx[TRAIN_SPEED.index].payload)
+        inputs.speed = get(word, TRAIN_SPEED.Speed) << _SPEED_SHIFT
+        core.quality = get(word, TRAIN_SPEED.Quality)
+    if receive(state.links[TRAIN_POSITION.index], rx[TRAIN_POSITION.index], TRAIN_POSITION.data_id):
+        word = int64(rx[TRAIN_POSITION.index].payload)
+        inputs.position = get(word, TRAIN_POSITION.Position) << _POSITION_SHIFT
+        if get(word, TRAIN_POSITION.Tick) != (int64(core.tick) & TICK_MASK):
+            core.faults = int64(core.faults) | FAULT_TICK
+    if receive(state.links[ATP_LIMIT.index], rx[ATP_LIMIT.index], ATP_LIMIT.data_id):
+        word = int64(rx[ATP_LIMIT.index].payload)
+        core.permitted_speed = sat32(get(word, ATP_LIMIT.PermittedSpeed) * _PERMITTED_FACTOR)
+        core.supervision = get(word, ATP_LIMIT.Supervision)
+
+
+@step
+def read_reference(params: Any, state: Any) -> None:
+    """The onboard reference now and `preview` ticks ahead."""
+    inputs = state.inputs
+    inputs.reference_position = reference.position(state.cursor)
+    inputs.reference_speed = reference.speed(params.reference, state.cursor)
+    inputs.reference_acceleration = reference.acceleration(params.reference, state.cursor)
+    inputs.ahead_position = reference.position(state.ahead)
+    inputs.ahead_speed = reference.speed(params.reference, state.ahead)
+    inputs.ahead_acceleration = reference.acceleration(params.reference, state.ahead)
+
+
+@step
+def car_words(core: Any, tx: Any, cars: Any) -> None:
+    """CAR_FORCE_1 to CAR_FORCE_4, two cars a frame, as many as there are cars."""
+    if cars > 0:
+        send(
+            core,
+            tx,
+            CAR_FORCE_1,
+            put(CAR_FORCE_1.Car1, saturate(CAR_FORCE_1.Car1, int64(core.car_force[0])))
+            + put(CAR_FORCE_1.Car2, saturate(CAR_FORCE_1.Car2, int64(core.car_force[1]))),
+        )
+    if cars > 2:
+        send(
+            core,
+            tx,
+            CAR_FORCE_2,
+            put(CAR_FORCE_2.Car3, saturate(CAR_FORCE_2.Car3, int64(core.car_force[2])))
+            + put(CAR_FORCE_2.Car4, saturate(CAR_FORCE_2.Car4, int64(core.car_force[3]))),
+        )
+    if cars > 4:
+        send(
+            core,
+            tx,
+            CAR_FORCE_3,
+            put(CAR_FORCE_3.Car5, saturate(CAR_FORCE_3.Car5, int64(core.car_force[4])))
+            + put(CAR_FORCE_3.Car6, saturate(CAR_FORCE_3.Car6, int64(core.car_force[5]))),
+        )
+    if cars > 6:
+        send(
+            core,
+            tx,
+            CAR_FORCE_4,
+            put(CAR_FORCE_4.Car7, saturate(CAR_FORCE_4.Car7, int64(core.car_force[6])))
+            + put(CAR_FORCE_4.Car8, saturate(CAR_FORCE_4.Car8, int64(core.car_force[7]))),
+        )
+
+
+@step
+def estimate_word(index: Any, exponent: Any, value: Any) -> Any:
+    """ATO_ESTIMATE; the multiplexed signals share one place."""
+    return (
+        put(ATO_ESTIMATE.Index, index)
+        + put(ATO_ESTIMATE.Exponent, exponent)
+        + put(ATO_ESTIMATE.Estimate0, value)
+    )
+
+
+def build_tick(law_step: Any) -> Any:
+    """The cyclic task around one law, as a step `tick(params, profile, state, memory, rx, tx)`.
+
+    Shapes: params and state one record of `params_dtype`/`state_dtype`; profile [segments] of reference.SEGMENT; memory
+    [2, cells, words]; rx, tx [MESSAGE_COUNT] of codec.MAILBOX.
+    """
+
+    @step
+    def run_tick(params: Any, profile: Any, state: Any, cells: Any, tx: Any) -> None:
+        core = state.core
+        inputs = state.inputs
+        read_reference(params, state)
+        inputs.tick = core.tick
+        inputs.iteration = core.iteration
+
+        memory.gather(params.memory, state.memory, cells, state.cell)
+        law_step(params.law, state.law, state.cell, inputs, state.outputs)
+        memory.scatter(params.memory, state.memory, cells, state.cell)
+
+        faults = (
+            int64(core.faults)
+            | int64(state.outputs.status)
+            | guard.faults_of_inputs(
+                params.guard,
+                int64(state.links[TRAIN_SPEED.index].age),
+                int64(state.links[TRAIN_POSITION.index].age),
+                int64(state.links[ATP_LIMIT.index].age),
+                int64(state.links[RUN_CTRL.index].age),
+                int64(core.quality),
+            )
+            | guard.faults_of_motion(
+                int64(inputs.speed), int64(core.permitted_speed), int64(core.supervision)
+            )
+        )
+        core.faults = faults
+        core.guard = guard.state_of(faults)
+        wanted = int64(state.outputs.force)
+        specific = guard.limited(params.guard, int64(core.guard), wanted)
+        force = round_shift(specific * int64(params.core.mass), Q_ACCELERATION)
+        raw = saturate(FORCE_CMD.Force, force >> _FORCE_SHIFT)
+        force = raw << _FORCE_SHIFT
+        inputs.limited = 1 if specific != wanted else 0
+        core.force = force
+        distribution.distribute(params.distribution, force, core.car_force)
+
+        tick = int64(core.tick)
+        car_words(core, tx, int64(params.distribution.cars))
+        phase = tick % STATUS_PERIOD
+        if phase == 0:
+            send(core, tx, ATO_STATUS, status_word(params, core))
+            send(core, tx, ATO_TRACKING, tracking_word(inputs))
+        if phase < int64(params.core.estimates):
+            send(
+                core,
+                tx,
+                ATO_ESTIMATE,
+                estimate_word(
+                    phase,
+                    int64(params.core.exponent[phase]),
+                    int64(state.outputs.estimate[phase]),
+                ),
+            )
+        mode = int64(COAST)
+        if force > 0:
+            mode = int64(TRACTION)
+        if force < 0:
+            mode = int64(BRAKE)
+        send(
+            core,
+            tx,
+            FORCE_CMD,
+            put(FORCE_CMD.Force, raw)
+            + put(FORCE_CMD.Mode, mode)
+            + put(FORCE_CMD.Tick, tick & TICK_MASK),
+        )
+        reference.advance(params.reference, state.cursor, profile)
+        reference.advance(params.reference, state.ahead, profile)
+        core.tick = tick + 1
+
+    @step
+    def tick(params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any) -> None:
+        core = state.core
+        if receive(state.links[RUN_CTRL.index], rx[RUN_CTRL.index], RUN_CTRL.data_id):
+            word = int64(rx[RUN_CTRL.index].payload)
+            wanted = get(word, RUN_CTRL.RunState)
+            if wanted == RUNNING:
+                # A run starts only from armed: a controller that restarts inside a run stays silent.
+                if int64(core.run_state) == ARMED:
+                    core.run_state = RUNNING
+            else:
+                core.run_state = wanted
+                core.iteration = get(word, RUN_CTRL.Iteration)
+                if wanted == ARMED:
+                    begin(params, profile, state)
+                send(core, tx, ATO_STATUS, status_word(params, core))
+        if int64(core.run_state) == RUNNING:
+            read_inputs(state, rx)
+            run_tick(params, profile, state, cells, tx)
+
+    return tick
+

@@ -1,0 +1,184 @@
+"""CAILC: constrained adaptive iterative learning control of a multi-car subway train (paper 1, eqs. (30)-(35)).
+
+    e      = x - x_r,   ed = v - v_r                                tracking errors
+    delta  = alpha e + ed                                           augmented error
+    chi    = delta / cos^2(pi/2 r),  r = min(delta^2 / nu_b^2, r_max)   barrier                 (30)
+    Xi_i   = clamp(Xi_{i-1} + Gamma xi chi, Xi_min, Xi_max)         along runs, xi = [-1, -v, -v^2]  (33)-(35)
+    u      = Xi_1 + Xi_2 v + Xi_3 v^2 + M a_r - M alpha ed - beta delta                         (31)
+
+Everything is divided by the mass M: f = u/M, theta = Xi/M, Gamma/M, beta/M. Order in a tick: measure, delta, chi, Xi_i
+(with the current chi), u. a_r is previewed by the actuator's lag (firmware), e and ed are of now.
+
+r_max is not in the paper: unclamped, chi is arbitrary where |delta| >= nu_b (the cosine is periodic). With the paper's
+gains 0.98 reproduces the paper; with faster learning 0.75 keeps the sampled loop's slope below 1.
+
+| symbol   | unit    | format        | symbol    | unit  | format |
+| e, ed, delta, chi | m, m/s | Q24   | a_r, f    | m/s^2 | Q27    |
+| theta_1  | m/s^2   | Q34, +-0.125  | alpha     | 1/s   | Q16    |
+| theta_2  | 1/s     | 2^-39         | beta/M    | 1/s   | Q24    |
+| theta_3  | 1/m     | 2^-43         | Gamma_q/M | -     | Q30, Q43, Q49 |
+| v        | m/s     | Q22, +-32     | 1/nu_b^2  | -     | see calibrate |
+
+theta is finer than the table of `controller/q.py`: one run changes it by 1e-6 of its range.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from can_dbc.step import int64, step
+from controller.interface import FAULT_BARRIER
+from controller.q import clamp, round_shift, sat32, sin_half_pi
+from controller.quantise import Vehicle, fixed
+
+THETA_Q = (34, 39, 43)
+GAMMA_Q = (30, 43, 49)
+
+PARAMS = np.dtype(
+    [
+        ("alpha", np.int32),  # 1/s, Q16
+        ("beta", np.int32),  # beta/M, 1/s, Q24
+        ("gamma", np.int32, (3,)),  # Gamma_q/M: Q30, Q43, Q49
+        ("nu_b", np.int32),  # m/s, Q24
+        ("inverse_nu_b", np.int32),  # 1/nu_b, s/m, Q16
+        ("s_min", np.int32),  # 1 - r_max, Q30
+        ("theta_min", np.int32, (3,)),
+        ("theta_max", np.int32, (3,)),
+        ("force_max", np.int32),  # m/s^2, Q27
+        ("padding", np.int32),
+    ],
+    align=True,
+)
+
+STATE = np.dtype([("delta", np.int32), ("chi", np.int32)], align=True)
+
+# Learned words: name, unit, Q.
+WORDS = (("Xi_1/M", "m/s^2", 34), ("Xi_2/M", "1/s", 39), ("Xi_3/M", "1/m", 43))
+# Estimates in the traces: name, unit, Q.
+ESTIMATES = (*WORDS, ("delta", "m/s", 24), ("chi", "m/s", 24))
+
+
+class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Gains as in the paper, SI: forces in N, M in kg."""
+
+    alpha: float  # 1/s
+    beta: float  # N s/m
+    Gamma: tuple[float, float, float]  # diagonal
+    nu_b: float  # m/s
+    r_max: float  # 0..1
+    Xi_min: tuple[float, float, float]  # N, N s/m, N s^2/m^2
+    Xi_max: tuple[float, float, float]
+    Xi_initial: tuple[float, float, float]
+
+
+def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
+    """PARAMS, shape (1,), from SI gains. Raises CalibrationError where a gain does not fit its format."""
+    mass = vehicle.mass_kg
+    params = np.zeros(1, PARAMS)
+    params["alpha"] = fixed("alpha", gains.alpha, 16)
+    params["beta"] = fixed("beta / M", gains.beta / mass, 24)
+    for q in range(3):
+        params["gamma"][0, q] = fixed(f"Gamma[{q}] / M", gains.Gamma[q] / mass, GAMMA_Q[q], 27 if q else 32)
+        params["theta_min"][0, q] = fixed(f"Xi_min[{q}] / M", gains.Xi_min[q] / mass, THETA_Q[q])
+        params["theta_max"][0, q] = fixed(f"Xi_max[{q}] / M", gains.Xi_max[q] / mass, THETA_Q[q])
+    params["nu_b"] = fixed("nu_b", gains.nu_b, 24)
+    params["inverse_nu_b"] = fixed("1 / nu_b", 1 / gains.nu_b, 16)
+    params["s_min"] = fixed("1 - r_max", 1 - gains.r_max, 30)
+    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, 27)
+    return params
+
+
+def learned(gains: Gains, vehicle: Vehicle) -> tuple[list[int], list[int], list[int]]:
+    """Initial value, lower and upper bound of each learned word."""
+    mass = vehicle.mass_kg
+
+    def words(name: str, values: tuple[float, ...]) -> list[int]:
+        return [fixed(f"{name}[{q}] / M", values[q] / mass, THETA_Q[q]) for q in range(3)]
+
+    low, high = words("Xi_min", gains.Xi_min), words("Xi_max", gains.Xi_max)
+    initial = words("Xi_initial", gains.Xi_initial)
+    return [min(max(i, lo), hi) for i, lo, hi in zip(initial, low, high, strict=True)], low, high
+
+
+@step
+def barrier(delta: Any, nu_b: Any, inverse_nu_b: Any, s_min: Any) -> Any:
+    """chi = delta / cos^2(pi/2 r), Q24 saturated to +-128; cos(pi/2 r) = sin(pi/2 (1 - r)); one division."""
+    ratio = (clamp(delta, -nu_b, nu_b) * inverse_nu_b) >> 10  # delta / nu_b in [-1, 1], Q30
+    r = (ratio * ratio) >> 30
+    s = max((int64(1) << 30) - r, s_min)
+    sine = sin_half_pi(s)
+    square = (sine * sine) >> 30
+    return sat32((delta << 30) // max(square, int64(1)))
+
+
+@step
+def errors(params: Any, state: Any, inputs: Any) -> Any:
+    """ed, Q24; writes state.delta = alpha e + ed, Q24, with e limited to +-16 m."""
+    e = clamp(
+        (int64(inputs.position) - int64(inputs.reference_position)) << 9,
+        -(int64(1) << 28),
+        int64(1) << 28,
+    )
+    ed = sat32(int64(inputs.speed) - int64(inputs.reference_speed))
+    state.delta = sat32(round_shift(int64(params.alpha) * e, 16) + ed)
+    return ed
+
+
+@step
+def increments(params: Any, chi: Any, speed: Any, cell: Any) -> None:
+    """cell.learn = Gamma xi chi / M with xi = [-1, -v, -v^2]; chi Q24, v Q22."""
+    chi_v = round_shift(chi * speed, 22)
+    # Beyond 2^37 (8192 m^3/s^3) every theta is at its bound anyway; the product with Gamma stays below 2^63.
+    chi_v2 = clamp(round_shift(chi_v * speed, 22), -(int64(1) << 37), int64(1) << 37)
+    cell.learn[0] = sat32(-round_shift(chi * int64(params.gamma[0]), 20))
+    cell.learn[1] = sat32(-round_shift(chi_v * int64(params.gamma[1]), 28))
+    cell.learn[2] = sat32(-round_shift(chi_v2 * int64(params.gamma[2]), 30))
+
+
+@step
+def force(params: Any, theta_1: Any, theta_2: Any, theta_3: Any, speed: Any, inputs: Any, ed: Any, delta: Any) -> Any:
+    """(31) divided by M, Q27: learned resistance, acceleration, damping; limited to what the actuators give."""
+    v2 = (speed * speed) >> 28  # Q16
+    resistance = (
+        round_shift(theta_1, 7) + round_shift(theta_2 * speed, 34) + round_shift(theta_3 * v2, 32)
+    )
+    damping = round_shift(int64(params.alpha) * ed, 13) + round_shift(int64(params.beta) * delta, 21)
+    wanted = resistance + int64(inputs.ahead_acceleration) - damping
+    return clamp(wanted, -int64(params.force_max), int64(params.force_max))
+
+
+@step
+def cailc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+    """One tick of CAILC."""
+    ed = errors(params, state, inputs)
+    delta = int64(state.delta)
+    speed = clamp(int64(inputs.speed) >> 2, -(int64(1) << 27), int64(1) << 27)  # Q22, +-32 m/s
+    chi = barrier(delta, int64(params.nu_b), int64(params.inverse_nu_b), int64(params.s_min))
+    state.chi = chi
+    increments(params, chi, speed, cell)
+
+    theta_1 = clamp(
+        int64(cell.before[0]) + int64(cell.learn[0]),
+        int64(params.theta_min[0]),
+        int64(params.theta_max[0]),
+    )
+    theta_2 = clamp(
+        int64(cell.before[1]) + int64(cell.learn[1]),
+        int64(params.theta_min[1]),
+        int64(params.theta_max[1]),
+    )
+    theta_3 = clamp(
+        int64(cell.before[2]) + int64(cell.learn[2]),
+        int64(params.theta_min[2]),
+        int64(params.theta_max[2]),
+    )
+    outputs.force = force(params, theta_1, theta_2, theta_3, speed, inputs, ed, delta)
+    outputs.status = FAULT_BARRIER if abs(delta) >= int64(params.nu_b) else 0
+    outputs.estimate[0] = theta_1
+    outputs.estimate[1] = theta_2
+    outputs.estimate[2] = theta_3
+    outputs.estimate[3] = delta
+    outputs.estimate[4] = chi

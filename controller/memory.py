@@ -1,0 +1,163 @@
+"""Learning memory: what one run leaves for the next, on a grid of `decimation` control periods.
+
+An array [2, cells, words] of int32 (or int16): one generation is read while the other is written, so that a run in which
+a fault occurred is dropped whole, and linear interpolation never reads what this run has just written. For every tick the
+memory gathers `before[w]` (what the previous runs left for this tick) for the law, and takes `learn[w]` from it. The increment
+of a cell is the mean of `learn` over the cell's ticks, added once to what the cell held, and clamped; it is stored `lead`
+ticks earlier than it was measured, which is what keeps learning stable when the actuator lags.
+
+Contract: `gather` and `scatter` are steps of bounded time that run inside the tick; `start_run`, `end_run` run between
+runs. The caller owns every buffer.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from can_dbc.step import int64, step
+from controller.q import clamp, divide_round, round_shift, sat32
+
+WORDS_MAX = 8
+
+CELL = np.dtype(
+    [
+        ("before", np.int32, (WORDS_MAX,)),  # in: value that the previous runs left for this tick
+        ("learn", np.int32, (WORDS_MAX,)),  # out: increment that this tick asks for
+    ],
+    align=True,
+)
+
+MEMORY_PARAMS = np.dtype(
+    [
+        ("words", np.int32),  # words a cell, 0..WORDS_MAX; 0 is a law that does not learn
+        ("cells", np.int32),
+        ("decimation", np.int32),  # ticks a cell
+        ("lead", np.int32),  # ticks
+        ("linear", np.int32),  # 1: interpolate between cell centres, 0: hold
+        ("weight", np.int32),  # 2^30 / (2 * decimation)
+        ("scale", np.int32),  # value of one stored unit: 1, or a power of two for int16 storage
+        ("padding", np.int32),
+        ("low", np.int32, (WORDS_MAX,)),  # bounds of a value
+        ("high", np.int32, (WORDS_MAX,)),
+        ("initial", np.int32, (WORDS_MAX,)),  # value of every cell before the first run
+    ],
+    align=True,
+)
+
+MEMORY_STATE = np.dtype(
+    [
+        ("sum", np.int64, (WORDS_MAX,)),  # of `learn` over the ticks of the open cell
+        ("generation", np.int32),  # which half is read, 0 or 1
+        ("read_cell", np.int32),
+        ("read_phase", np.int32),  # tick inside the cell that is read
+        ("write_cell", np.int32),
+        ("write_phase", np.int32),  # ticks summed in the cell that is written
+        ("wait", np.int32),  # ticks until the first increment has somewhere to go
+    ],
+    align=True,
+)
+
+
+@step
+def rewind(params: Any, state: Any) -> None:
+    """The state at the start of a run; the generation stays."""
+    for w in range(WORDS_MAX):
+        state.sum[w] = 0
+    state.read_cell = 0
+    state.read_phase = 0
+    state.write_cell = 0
+    state.write_phase = 0
+    state.wait = params.lead
+
+
+@step
+def gather(params: Any, state: Any, memory: Any, cell: Any) -> None:
+    """`cell.before` for the current tick, and the read position one tick on."""
+    words = int64(params.words)
+    if words > 0:
+        generation = int64(state.generation)
+        decimation = int64(params.decimation)
+        here = int64(state.read_cell)
+        phase = int64(state.read_phase)
+        last = int64(params.cells) - 1
+        # Distance from the cell's centre in half ticks; the neighbour on that side has the weight |offset| / (2 D).
+        offset = 2 * phase - (decimation - 1)
+        neighbour = here
+        if int64(params.linear) == 1:
+            neighbour = here + 1 if offset > 0 else here - 1
+        weight = abs(offset) * int64(params.weight)
+        here = clamp(here, int64(0), last)
+        neighbour = clamp(neighbour, int64(0), last)
+        scale = int64(params.scale)
+        for w in range(WORDS_MAX):
+            if w < words:
+                near = int64(memory[generation, here, w])
+                far = int64(memory[generation, neighbour, w])
+                value = near + round_shift((far - near) * weight, 30)
+                cell.before[w] = sat32(value * scale)
+        phase += 1
+        if phase >= decimation:
+            phase = int64(0)
+            here = int64(state.read_cell) + 1
+            state.read_cell = min(here, last)
+        state.read_phase = phase
+
+
+@step
+def scatter(params: Any, state: Any, memory: Any, cell: Any) -> None:
+    """Takes `cell.learn` of the current tick; closes the cell with its last tick."""
+    words = int64(params.words)
+    if words > 0:
+        if int64(state.wait) > 0:
+            state.wait = int64(state.wait) - 1
+        else:
+            for w in range(WORDS_MAX):
+                if w < words:
+                    state.sum[w] = int64(state.sum[w]) + int64(cell.learn[w])
+            state.write_phase = int64(state.write_phase) + 1
+            if int64(state.write_phase) >= int64(params.decimation):
+                close_cell(params, state, memory)
+
+
+@step
+def close_cell(params: Any, state: Any, memory: Any) -> None:
+    """Adds the mean increment of the open cell to its value in the generation that is written; opens the next."""
+    ticks = int64(state.write_phase)
+    here = int64(state.write_cell)
+    if ticks > 0 and here < int64(params.cells):
+        scale = int64(params.scale)
+        read = int64(state.generation)
+        for w in range(WORDS_MAX):
+            if w < int64(params.words):
+                mean = divide_round(int64(state.sum[w]), ticks)
+                before = int64(memory[read, here, w]) * scale
+                value = clamp(before + mean, int64(params.low[w]), int64(params.high[w]))
+                memory[1 - read, here, w] = divide_round(value, scale)
+                state.sum[w] = 0
+        state.write_phase = 0
+        state.write_cell = here + 1
+
+
+def initial_memory(params: np.void, dtype: type = np.int32) -> np.ndarray:
+    """Memory [2, cells, words] before the first run, all cells at `initial`."""
+    cells, words = int(params["cells"]), int(params["words"])
+    memory = np.zeros((2, cells, words), dtype)
+    memory[:] = params["initial"][:words] // int(params["scale"])
+    return memory
+
+
+def start_run(state: np.void, memory: np.ndarray) -> None:
+    """The generation that will be written starts as a copy: cells that this run does not reach keep their value."""
+    read = int(state["generation"])
+    memory[1 - read] = memory[read]
+
+
+def end_run(params: np.void, state: np.void, memory: np.ndarray, keep: bool) -> None:
+    """Closes the open cell with the ticks that it had and, if the run is kept, makes it the one that is read."""
+    if int(params["words"]) == 0:
+        return
+    close_cell(params, state, memory)
+    if keep:
+        state["generation"] = 1 - int(state["generation"])

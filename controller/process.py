@@ -1,0 +1,84 @@
+"""The controller process: payloads from the bus into the mailboxes, a tick, payloads from the mailboxes to the bus.
+
+Started with a calibration file; knows nothing of the plant. A tick starts with TRAIN_POSITION inside a run, and with RUN_CTRL outside
+one. Internal: `ato-hil run` starts it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import can
+
+from can_dbc.bus import BusError, open_bus, recv_frames, send_frames
+from can_dbc.child import Stop, follow_parent, tell
+from can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGES, RUN_CTRL, TRAIN_POSITION
+from controller import calibration, node, store
+from controller.interface import RUNNING
+from controller.quantise import CalibrationError
+from controller.registry import LawError
+
+RECEIVE_TIMEOUT_S = 0.1
+FRAME_IDS = [message.frame_id for message in MESSAGES]
+
+
+def serve(controller: node.Controller, bus: can.BusABC, stop: Stop) -> None:
+    """Answers the plant until `stop`. Raises can.CanError if the bus is gone."""
+    rx_payload, rx_fresh = controller.rx["payload"], controller.rx["fresh"]
+    tx, tx_fresh = controller.tx, controller.tx["fresh"]
+    core = controller.state["core"]
+    while not stop.requested:
+        for frame_id, payload in recv_frames(bus, RECEIVE_TIMEOUT_S):
+            index = INDEX_OF_FRAME_ID.get(frame_id)
+            if index is None:
+                continue
+            rx_payload[index] = payload
+            rx_fresh[index] = 1
+            outside_run = frame_id == RUN_CTRL.frame_id and core["run_state"] != RUNNING
+            if frame_id != TRAIN_POSITION.frame_id and not outside_run:
+                continue
+            node.cycle(controller)
+            rx_fresh[:] = 0
+            answers = [
+                (FRAME_IDS[i], word) for i, (word, fresh, _) in enumerate(tx.tolist()) if fresh
+            ]
+            tx_fresh[:] = 0
+            if answers:
+                send_frames(bus, answers)
+
+
+def main() -> int:
+    """Exit status 0 after SIGTERM, 1 for bad input, 2 if the bus is gone."""
+    parser = argparse.ArgumentParser(prog="python -m controller.process", description=__doc__)
+    parser.add_argument("--calibration", type=Path, required=True)
+    parser.add_argument("--bus", required=True)
+    parser.add_argument("--memory", type=Path)
+    arguments = parser.parse_args()
+    stop = Stop()
+    follow_parent()
+    try:
+        controller = node.build(calibration.load(arguments.calibration), arguments.memory)
+        node.cycle(controller)  # compiles, or loads what was compiled before
+        controller.tx["fresh"][:] = 0
+        bus = open_bus(arguments.bus)
+    except (CalibrationError, LawError, store.MemoryFileError, BusError) as error:
+        tell("error", message=str(error))
+        return 1
+    tell("ready", state_bytes=controller.state_bytes, memory_bytes=controller.memory_bytes)
+    try:
+        serve(controller, bus, stop)
+    except can.CanError as error:
+        tell("error", message=f"controller: bus {arguments.bus} is gone: {error}")
+        return 2
+    except OSError as error:
+        tell("error", message=f"controller: memory file: {error}")
+        return 1
+    finally:
+        bus.shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,27 @@
+"""From SI numbers to integers: the float side of calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+class CalibrationError(ValueError):
+    """A number of the scenario has no integer form; the message names the key, the value and the range."""
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """What the controller knows of its train."""
+
+    mass_kg: float
+    period_s: float  # control period
+    force_max_m_s2: float  # largest specific force of the actuators
+
+
+def fixed(key: str, value: float, q: int, bits: int = 32) -> int:
+    """`value` in units of 2**-q as a signed integer of `bits`; raises CalibrationError if it does not fit."""
+    scaled = round(value * 2.0**q)
+    if not -(2 ** (bits - 1)) <= scaled < 2 ** (bits - 1):
+        limit = 2.0 ** (bits - 1 - q)
+        raise CalibrationError(f"{key}: {value:g} is outside what the firmware holds, +-{limit:g}")
+    return scaled

@@ -1,0 +1,456 @@
+"""Planner: turns ramps, cruises and closing conditions into the segment table of the onboard reference.
+
+A ramp is a jerk pulse, a stretch of constant acceleration and the opposite pulse; its speed change divided by its peak
+acceleration is the time between the pulses. These times seldom are whole control periods. Each pulse is therefore laid
+onto whole ticks so that its area (the peak acceleration) and the difference of the two first moments (the speed change)
+are exact integers and the ramp stays centred: the acceleration returns to exactly 0, the train stands at the end to the
+last bit, and lengths are those of continuous time.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from plant_sim.profile import INT32, POSITION_UNIT_M, SEGMENT, Profile, evaluate, unit_factors
+
+Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
+Change = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+
+DISTANCE_TOLERANCE_M = 1e-3
+SPEED_TOLERANCE_M_S = 1e-6  # rounding of speed levels, far below what a limit can mean
+SINUSOID_POSITION_M = 1e-3  # largest deviation of a sinusoidal ramp's table from the sine
+SINUSOID_SPEED_M_S = 1e-4
+
+
+class PlanError(ValueError):
+    """A plan that contradicts itself or breaks a limit; the message is one line."""
+
+
+class SpeedLimit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A limit over time, from the end of the one before it (exclusive) to `until_s` (inclusive)."""
+
+    until_s: Positive
+    speed_m_s: Positive
+
+
+class Ramp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A change of speed; the train then cruises (or stands) until the next one.
+
+    Target: one of `to_m_s` (a number, or "solved": the speed that meets the distance), `to_km_h`, `by_m_s`.
+    Time: at most one of `start_s`, `end_s` and `after_s` (the end of the ramp before; 0 if none is given).
+    Shape: `acceleration_m_s2` and `jerk_m_s3`; or `sinusoidal_s`, the duration of a raised-cosine acceleration.
+    """
+
+    to_m_s: NotNegative | Literal["solved"] | None = None
+    to_km_h: NotNegative | None = None
+    by_m_s: Change | None = None
+    start_s: NotNegative | None = None
+    end_s: NotNegative | None = None
+    after_s: NotNegative | None = None
+    acceleration_m_s2: Positive | None = None
+    jerk_m_s3: Positive | None = None
+    sinusoidal_s: Positive | None = None
+
+    def __post_init__(self) -> None:
+        if _given(self.to_m_s, self.to_km_h, self.by_m_s) != 1:
+            raise PlanError("a ramp needs one of to_m_s, to_km_h and by_m_s")
+        if _given(self.start_s, self.end_s, self.after_s) > 1:
+            raise PlanError("a ramp takes only one of start_s, end_s and after_s")
+        levels = _given(self.acceleration_m_s2, self.jerk_m_s3)
+        if levels != (2 if self.sinusoidal_s is None else 0):
+            raise PlanError("a ramp needs acceleration_m_s2 and jerk_m_s3, or sinusoidal_s alone")
+
+
+class ProfilePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A run from standstill to standstill, and what it has to keep."""
+
+    duration_s: Positive
+    distance_m: Positive  # met within 1 mm
+    max_speed_m_s: Positive
+    max_acceleration_m_s2: Positive
+    max_jerk_m_s3: Positive
+    ramps: tuple[Ramp, ...]
+    limits: tuple[SpeedLimit, ...] = ()  # none: no limit over time
+    margin_m_s: NotNegative = 0.0  # to keep below `limits`
+
+
+@dataclass(frozen=True)
+class Units:
+    """What one unit of the table is worth."""
+
+    period_s: float
+    acceleration_m_s2: float
+    jerk_m_s3: float
+    change_m_s: float  # two speed units: a ramp always changes the speed by an even number
+
+
+@dataclass(frozen=True)
+class PlacedRamp:
+    """A ramp with its times in control periods, fractions included."""
+
+    number: int  # 1 is the first of the plan
+    sinusoidal: bool
+    change: int  # of speed, in Units.change_m_s
+    start: float
+    rise: float  # of the acceleration, as long as its fall; half the duration if sinusoidal
+    duration: float
+
+    @property
+    def end(self) -> float:
+        return self.start + self.duration
+
+    @property
+    def centre(self) -> float:
+        return self.start + self.duration / 2
+
+
+def plan_profile(plan: ProfilePlan, period_s: float) -> np.ndarray:
+    """The `SEGMENT` table of a plan, shape (segments,), at a control period.
+
+    A ramp's peak acceleration and jerk exceed its levels by less than two units of the table (1.1e-7 m/s^2 and
+    1.1e-5 m/s^3 at 10 ms). Where no cruise lies between two ramps, one may end and the next begin inside one tick.
+    Raises PlanError if the plan cannot be met, ValueError for a period that the table cannot have.
+    """
+    units = _units(period_s)
+    ticks = _whole_ticks(plan.duration_s, "duration_s", units)
+    ramps = _place(plan, units, _solve_speed(plan, units))
+    _check_ramps(plan, ramps, units)
+
+    rows = np.zeros(ticks + 1, np.int64)  # jerk by tick, and one that no ramp may need
+    for ramp in ramps:
+        if ramp.sinusoidal:
+            first = round(ramp.start)
+            rows[first : first + round(ramp.duration)] += _sinusoid(ramp, units)
+        else:
+            _add_ramp(rows, ramp)
+    if rows[ticks] != 0:
+        raise PlanError(f"ramp {len(ramps)} ends after duration_s = {plan.duration_s:g}")
+
+    segments = _segments(rows[:ticks])
+    _check_profile(plan, evaluate(segments, period_s), units)
+    return segments
+
+
+def limit_at(limits: tuple[SpeedLimit, ...], ticks: NDArray[np.int64], period_s: float) -> Any:
+    """The limit in m/s at each of `ticks`; shape of `ticks`. Raises PlanError if it does not cover them in order."""
+    units = _units(period_s)
+    until = [_whole_ticks(limit.until_s, "until_s of a limit", units) for limit in limits]
+    if any(later <= earlier for earlier, later in itertools.pairwise(until)):
+        raise PlanError("the until_s of the limits do not increase")
+    if not until or until[-1] < ticks.max():
+        raise PlanError(f"the limits end before {ticks.max() * period_s:g} s")
+    speeds = np.array([limit.speed_m_s for limit in limits])
+    return speeds[np.searchsorted(until, ticks)]
+
+
+# Placing the ramps in time.
+
+
+def _solve_speed(plan: ProfilePlan, units: Units) -> float:
+    """The speed of the "solved" ramps, m/s; 0 without any."""
+    if not any(ramp.to_m_s == "solved" for ramp in plan.ramps):
+        return 0.0
+
+    low, high = 0.0, plan.max_speed_m_s
+    shortest, longest = _distance_m(plan, units, low), _distance_m(plan, units, high)
+    if not shortest <= plan.distance_m <= longest:
+        raise PlanError(
+            f"distance_m = {plan.distance_m:g} is out of reach: a solved speed of 0 to {high:g} m/s"
+            f" gives {shortest:.3f} to {longest:.3f} m"
+        )
+    while high - low > units.change_m_s:
+        middle = (low + high) / 2
+        if _distance_m(plan, units, middle) < plan.distance_m:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def _distance_m(plan: ProfilePlan, units: Units, solved_m_s: float) -> float:
+    """Length of the plan; a ramp counts as a step of speed at its centre."""
+    ticks = plan.duration_s / units.period_s
+    steps = (ramp.change * (ticks - ramp.centre) for ramp in _place(plan, units, solved_m_s))
+    return sum(steps) * units.change_m_s * units.period_s
+
+
+def _place(plan: ProfilePlan, units: Units, solved_m_s: float) -> list[PlacedRamp]:
+    placed: list[PlacedRamp] = []
+    speed_m_s, level, end = 0.0, 0, 0.0
+    for number, ramp in enumerate(plan.ramps, 1):
+        speed_m_s = _target_m_s(ramp, speed_m_s, solved_m_s)
+        change = round(speed_m_s / units.change_m_s) - level
+        level += change
+        rise, duration = _durations(ramp, number, abs(change), units)
+        if ramp.start_s is not None:
+            start: float = _ramp_ticks(ramp.start_s, number, "start_s", units)
+        elif ramp.end_s is not None:
+            start = _ramp_ticks(ramp.end_s, number, "end_s", units) - duration
+        else:
+            start = end + _ramp_ticks(ramp.after_s or 0.0, number, "after_s", units)
+        sinusoidal = ramp.sinusoidal_s is not None
+        start = math.ceil(start) if sinusoidal else _snap(start)
+        placed.append(PlacedRamp(number, sinusoidal, change, start, rise, duration))
+        end = placed[-1].end
+    return placed
+
+
+def _target_m_s(ramp: Ramp, speed_m_s: float, solved_m_s: float) -> float:
+    if ramp.by_m_s is not None:
+        return speed_m_s + ramp.by_m_s
+    if ramp.to_km_h is not None:
+        return ramp.to_km_h / 3.6
+    if ramp.to_m_s == "solved":
+        return solved_m_s
+    assert ramp.to_m_s is not None
+    return ramp.to_m_s
+
+
+def _durations(ramp: Ramp, number: int, size: int, units: Units) -> tuple[float, float]:
+    """Ticks in which the acceleration rises, and ticks of the whole ramp, for a speed change of `size`."""
+    if ramp.sinusoidal_s is not None:
+        ticks = _ramp_ticks(ramp.sinusoidal_s, number, "sinusoidal_s", units)
+        return ticks / 2, ticks
+    if size == 0:
+        return 0.0, 0.0
+    assert ramp.acceleration_m_s2 is not None and ramp.jerk_m_s3 is not None
+    jerk = ramp.jerk_m_s3 / units.jerk_m_s3
+    # A small change turns from the one pulse to the other before the acceleration is reached.
+    peak = min(ramp.acceleration_m_s2 / units.acceleration_m_s2, math.sqrt(size * jerk))
+    rise = _snap(peak / jerk)
+    return rise, rise + _snap(size / peak)
+
+
+def _snap(ticks: float) -> float:
+    """A time without rounding noise: what falls on a tick on paper does so here."""
+    return round(ticks, 6)
+
+
+def _ramp_ticks(time_s: float, number: int, key: str, units: Units) -> int:
+    return _whole_ticks(time_s, f"ramp {number}: {key}", units)
+
+
+def _whole_ticks(time_s: float, name: str, units: Units) -> int:
+    ticks = round(time_s / units.period_s)
+    if abs(time_s / units.period_s - ticks) > 1e-6:
+        raise PlanError(f"{name} = {time_s:g} is not a multiple of the period {units.period_s:g} s")
+    return ticks
+
+
+# Laying a ramp onto whole ticks.
+
+
+def _add_ramp(rows: NDArray[np.int64], ramp: PlacedRamp) -> None:
+    # Rounded up, so that the pulses never need more room than on paper.
+    peak = math.ceil(abs(ramp.change) / (ramp.duration - ramp.rise))
+    slope = min(math.ceil(peak / ramp.rise), peak)
+    _add_pulses(rows, ramp.change, peak, slope, ramp.start, ramp.centre)
+
+
+def _add_pulses(
+    rows: NDArray[np.int64], change: int, peak: int, slope: int, start: float, centre: float
+) -> None:
+    """Add a pulse of area `peak` and its opposite, which together change the speed by exactly `change`.
+
+    That change is the difference of their first moments, each the sum of tick times jerk.
+    """
+    direction, size = (1, change) if change > 0 else (-1, -change)
+    earliest = peak * math.floor(start) + _box_moment(peak, slope)
+    rising = max(round(peak * (centre - 0.5) - size / 2), earliest)
+    for sign, moment in ((direction, rising), (-direction, rising + size)):
+        first, pulse = _pulse(peak, slope, moment)
+        rows[first : first + len(pulse)] += sign * pulse
+
+
+def _pulse(area: int, slope: int, moment: int) -> tuple[int, NDArray[np.int64]]:
+    """First tick and rows of a box of height `slope` with this area and first moment; slope <= area.
+
+    The box begins and ends inside a tick: its first and last rows are parts of `slope`. What then lacks of the moment
+    is less than a row; one unit of jerk moved that far to the last row supplies it.
+    """
+    full, rest = divmod(area, slope)
+    first, excess = divmod(moment - _box_moment(area, slope), area)
+    if excess <= full * (slope - rest):
+        inner = full - 1
+        last, lack = divmod(excess, full)
+        last += rest
+    else:
+        inner = full
+        last, lack = divmod(excess - full * (slope - rest), full + 1)
+    pulse = np.full(inner + 2, slope, np.int64)
+    pulse[0] = area - inner * slope - last
+    pulse[-1] = last
+    if lack:
+        pulse[-1 - lack] -= 1
+        pulse[-1] += 1
+    return first, pulse if pulse[-1] else pulse[:-1]
+
+
+def _box_moment(area: int, slope: int) -> int:
+    """First moment of a box that begins with tick 0: rows of `slope`, then one of what is left."""
+    full, rest = divmod(area, slope)
+    return slope * full * (full - 1) // 2 + rest * full
+
+
+def _sinusoid(ramp: PlacedRamp, units: Units) -> NDArray[np.int64]:
+    """Rows of a sinusoidal ramp, in the fewest segments that stay close to the sine."""
+    size, ticks = abs(ramp.change), round(ramp.duration)
+    x, v, _ = _raised_cosine(size, ticks, np.arange(ticks + 1) / ticks)
+    # Without rounding, n segments in each half deviate by 0.04 dv / n^3.
+    change_m_s = size * units.change_m_s
+    few = next(n for n in itertools.count(2) if n**3 * SINUSOID_SPEED_M_S > 0.04 * change_m_s)
+    for count in range(few, min(8 * few, ticks // 8)):
+        rows = _sinusoid_rows(size, ticks, count)
+        table = evaluate(_segments(rows), units.period_s)
+        position_m = np.abs(table.x - x).max() * POSITION_UNIT_M
+        speed_m_s = np.abs(table.v - v).max() * units.change_m_s / 2
+        if position_m < SINUSOID_POSITION_M and speed_m_s < SINUSOID_SPEED_M_S:
+            return rows if ramp.change > 0 else -rows
+    raise PlanError(f"ramp {ramp.number}: no small table follows a sinusoid of this duration")
+
+
+def _sinusoid_rows(size: int, ticks: int, count: int) -> NDArray[np.int64]:
+    """Rows with `count` segments up to the peak of the acceleration and their mirror image after it.
+
+    Straight lines between knots lie beside a curve by a twelfth of step^2 a'' on average, so the
+    knots lie as much on its other side. The first knot has to be 0; its step, shorter by sqrt(2),
+    makes up for that.
+    """
+    half = ticks // 2
+    step = half / (count - 1 + math.sqrt(0.5))
+    knots = [0, *(round(half - k * step) for k in reversed(range(count)))]
+    rows = np.zeros(ticks, np.int64)
+    v = a = 0
+    for begin, end in itertools.pairwise(knots):
+        n = end - begin
+        _, goal_v, goal_a = _raised_cosine(size, ticks, end / ticks)
+        mean_a = size / ticks
+        bend = (mean_a - goal_a) * (2 * math.pi / ticks) ** 2  # a''
+        goal_a -= bend * step**2 / 12
+        # What this knot lacks in speed, its acceleration shall have brought in by the next.
+        jerk = max(0, round((goal_v + 2 * n * goal_a - v - 4 * n * a) / (3 * n * n)))
+        rows[begin:end] = jerk
+        v += 2 * n * a + n * n * jerk
+        a += n * jerk
+    rows[ticks - half :] = -rows[:half][::-1]
+
+    missing = size - int(np.cumsum(rows).sum())
+    if missing:
+        peak = math.ceil(abs(missing) / half)
+        _add_pulses(rows, missing, peak, peak, 0, ticks / 2)
+    return rows
+
+
+def _raised_cosine(size: int, ticks: int, z: Any) -> tuple[Any, Any, Any]:
+    """Position, speed and acceleration (table units) of a sinusoidal ramp from rest at the part z of its time D:
+
+    a = dv/D (1 - cos(2 pi z)), v = dv (z - sin(2 pi z) / (2 pi)).
+    """
+    wave = _sine(math.pi * z) ** 2
+    x = 3 * size * ticks * (z * z - wave / math.pi**2)
+    v = 2 * size * (z - _sine(2 * math.pi * z) / (2 * math.pi))
+    a = 2 * size / ticks * wave
+    return x, v, a
+
+
+def _sine(angle: Any) -> Any:
+    """Sine of 0 to 2 pi by its series: the C library's differs between machines, and tables must not."""
+    total = term = angle
+    for k in range(1, 21):
+        term = term * (-angle * angle) / (2 * k * (2 * k + 1))
+        total = total + term
+    return total
+
+
+def _segments(rows: NDArray[np.int64]) -> np.ndarray:
+    """Join equal rows to segments."""
+    if np.abs(rows).max() > INT32.max:
+        raise PlanError("a jerk needs more than 32 bits: the control period is too long")
+    first = np.flatnonzero(np.diff(rows, prepend=rows[0] - 1))
+    segments = np.zeros(len(first), SEGMENT)
+    segments["ticks"] = np.diff(first, append=len(rows))
+    segments["jerk"] = rows[first]
+    return segments
+
+
+# Checks.
+
+
+def _check_ramps(plan: ProfilePlan, ramps: list[PlacedRamp], units: Units) -> None:
+    """Order, levels and speeds of the placed ramps."""
+    end_s, speed_m_s = 0.0, 0.0
+    for ramp, placed in zip(plan.ramps, ramps, strict=True):
+        name = f"ramp {placed.number}"
+        start_s = placed.start * units.period_s
+        if start_s < end_s - units.period_s * 1e-6:
+            raise PlanError(
+                f"{name} starts at {start_s:.3f} s, before the one before it ends at {end_s:.3f} s"
+                if placed.number > 1
+                else f"{name} starts at {start_s:.3f} s, before the run begins"
+            )
+        end_s = placed.end * units.period_s
+        speed_m_s += placed.change * units.change_m_s
+        if placed.change == 0:
+            raise PlanError(f"{name} does not change the speed")
+        if speed_m_s < -SPEED_TOLERANCE_M_S:
+            raise PlanError(f"{name} ends at {speed_m_s:.4f} m/s, below 0")
+        acceleration, jerk = _levels(ramp, placed, units)
+        _check_limit(name, "max_speed_m_s", speed_m_s, plan.max_speed_m_s + SPEED_TOLERANCE_M_S)
+        _check_limit(name, "max_acceleration_m_s2", acceleration, plan.max_acceleration_m_s2)
+        _check_limit(name, "max_jerk_m_s3", jerk, plan.max_jerk_m_s3)
+    if end_s > plan.duration_s + units.period_s * 1e-6:
+        raise PlanError(f"the last ramp ends at {end_s:.3f} s, duration_s = {plan.duration_s:g}")
+    if sum(placed.change for placed in ramps) != 0:
+        raise PlanError(f"the plan ends at {speed_m_s:.4f} m/s, expected standstill")
+
+
+def _levels(ramp: Ramp, placed: PlacedRamp, units: Units) -> tuple[float, float]:
+    """Peak acceleration and jerk of a ramp, m/s^2 and m/s^3."""
+    if ramp.acceleration_m_s2 is not None and ramp.jerk_m_s3 is not None:
+        return ramp.acceleration_m_s2, ramp.jerk_m_s3
+    duration_s = placed.duration * units.period_s
+    mean_m_s2 = abs(placed.change) * units.change_m_s / duration_s
+    return 2 * mean_m_s2, 2 * math.pi * mean_m_s2 / duration_s
+
+
+def _check_limit(name: str, key: str, value: float, limit: float) -> None:
+    if value > limit:
+        raise PlanError(f"{name} needs {value:g}, above {key} = {limit:g}")
+
+
+def _check_profile(plan: ProfilePlan, profile: Profile, units: Units) -> None:
+    """Length and limits over time of the finished table."""
+    length_m = float(profile.position_m[-1])
+    if abs(length_m - plan.distance_m) > DISTANCE_TOLERANCE_M:
+        raise PlanError(f"the plan is {length_m:.4f} m long, distance_m = {plan.distance_m:.4f}")
+    if plan.limits:
+        ticks = np.arange(len(profile.speed_m_s))
+        limit = limit_at(plan.limits, ticks, units.period_s)
+        over = profile.speed_m_s > limit - plan.margin_m_s + SPEED_TOLERANCE_M_S
+        if over.any():
+            tick = int(np.argmax(over))
+            raise PlanError(
+                f"{profile.speed_m_s[tick]:.4f} m/s at {tick * units.period_s:g} s is above the limit"
+                f" {limit[tick]:g} m/s less margin_m_s = {plan.margin_m_s:g}"
+            )
+
+
+def _units(period_s: float) -> Units:
+    _, acceleration_factor = unit_factors(period_s)
+    acceleration_m_s2 = acceleration_factor * POSITION_UNIT_M
+    return Units(
+        period_s=period_s,
+        acceleration_m_s2=acceleration_m_s2,
+        jerk_m_s3=acceleration_m_s2 / period_s,
+        change_m_s=acceleration_m_s2 * period_s,
+    )
+
+
+def _given(*values: object) -> int:
+    return sum(value is not None for value in values)

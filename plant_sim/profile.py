@@ -1,0 +1,107 @@
+"""The onboard reference: a table of constant-jerk segments, evaluated exactly in integers.
+
+A segment `(ticks, jerk)` holds one jerk for a whole number of control periods. With the control period T the units are
+
+    position       2^-40 m
+    speed      3 * 2^-40 / T     m/s     (2.7e-10 at T = 10 ms)
+    acceleration 6 * 2^-40 / T^2 m/s^2   (5.5e-8)
+    jerk       6 * 2^-40 / T^3   m/s^3   (5.5e-6)
+
+and one control period is, with the old values on the right,
+
+    x += 3 v + 3 a + J;   v += 2 a + J;   a += J
+
+which loses nothing: firmware, plant and reports agree to the bit. The profile starts at rest at position 0.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+SEGMENT = np.dtype([("ticks", np.int32), ("jerk", np.int32)], align=True)
+
+POSITION_UNIT_M = 2.0**-40
+LONGEST_PROFILE_S = 32768  # position at the top speed of Q24 stays within 64 bits
+INT32 = np.iinfo(np.int32)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The reference at the ticks 0 .. N; every column has N + 1 rows."""
+
+    x: NDArray[np.int64]  # 2^-40 m
+    v: NDArray[np.int64]  # 3 * 2^-40 / T m/s
+    a: NDArray[np.int64]  # 6 * 2^-40 / T^2 m/s^2
+    position_m: NDArray[np.float64]
+    speed_m_s: NDArray[np.float64]
+    acceleration_m_s2: NDArray[np.float64]
+    position_q15: NDArray[np.int32]
+    speed_q24: NDArray[np.int32]
+    acceleration_q27: NDArray[np.int32]
+
+
+def evaluate(segments: NDArray[np.void], period_s: float) -> Profile:
+    """Evaluate a table of `SEGMENT` rows at every tick.
+
+    Raises ValueError if the period is not one of the exact ones (see `unit_factors`), if a segment has no ticks,
+    or if the profile leaves the firmware's range (+-65.5 km, +-128 m/s, +-16 m/s^2) or lasts longer than 9 h.
+    """
+    speed_factor, acceleration_factor = unit_factors(period_s)
+    ticks = segments["ticks"].astype(np.int64)
+    if (ticks <= 0).any():
+        raise ValueError(f"segment {int(np.argmax(ticks <= 0)) + 1} of the profile has no ticks")
+    if ticks.sum() * period_s > LONGEST_PROFILE_S:
+        raise ValueError(f"the profile lasts longer than {LONGEST_PROFILE_S} s")
+
+    # Range-checking each column before it is summed into the next keeps every sum within 64 bits.
+    jerk = np.repeat(segments["jerk"].astype(np.int64), ticks)
+    a = _running_sum(jerk)
+    acceleration_q27 = _to_int32(a, acceleration_factor, 13, "acceleration")
+    v = _running_sum(2 * a[:-1] + jerk)
+    speed_q24 = _to_int32(v, speed_factor, 16, "speed")
+    x = _running_sum(3 * v[:-1] + 3 * a[:-1] + jerk)
+    position_q15 = _to_int32(x, 1, 25, "position")
+
+    return Profile(
+        x=x,
+        v=v,
+        a=a,
+        position_m=x * POSITION_UNIT_M,
+        speed_m_s=v * speed_factor * POSITION_UNIT_M,
+        acceleration_m_s2=a * acceleration_factor * POSITION_UNIT_M,
+        position_q15=position_q15,
+        speed_q24=speed_q24,
+        acceleration_q27=acceleration_q27,
+    )
+
+
+def unit_factors(period_s: float) -> tuple[int, int]:
+    """The integers 3/T and 6/T^2 that turn speed and acceleration units into 2^-40 m/s and 2^-40 m/s^2.
+
+    Raises ValueError if they are not integers: 10, 20, 50 and 100 ms are possible, 30 ms is not.
+    """
+    if not 0 < period_s <= 1:
+        raise ValueError(f"control period {period_s} s is not above 0 and at most 1 s")
+    speed_factor = round(3 / period_s)
+    acceleration_factor = round(6 / period_s**2)
+    exact = np.isclose(
+        [speed_factor * period_s, acceleration_factor * period_s**2], [3, 6], rtol=1e-12, atol=0
+    )
+    if not exact.all():
+        raise ValueError(f"control period {period_s} s does not make 3/T and 6/T^2 integers")
+    return speed_factor, acceleration_factor
+
+
+def _running_sum(steps: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.concatenate([np.zeros(1, np.int64), np.cumsum(steps)])
+
+
+def _to_int32(
+    values: NDArray[np.int64], factor: int, shift: int, name: str
+) -> NDArray[np.int32]:
+    half = 1 << (shift - 1)  # round half up, as the firmware does
+    lowest, highest = int(values.min()) * factor, int(values.max()) * factor
+    if (lowest + half) >> shift < INT32.min or (highest + half) >> shift > INT32.max:
+        raise ValueError(f"the {name} of the profile leaves the range of the firmware's format")
+    return ((values * factor + half) >> shift).astype(np.int32)

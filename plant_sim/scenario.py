@@ -1,0 +1,199 @@
+"""Scenarios: one TOML file holds every number of a run; validated on loading, with one clear line for what is wrong.
+
+A scenario may stand on another: `base = "subway-paper"` takes that one's values and replaces what this file states. Found by
+name among the packaged scenarios, or as the path of a file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from plant_sim.actuator import Actuator
+from plant_sim.planner import PlanError, ProfilePlan, plan_profile
+from plant_sim.profile import Profile, evaluate
+from plant_sim.track import Track
+from plant_sim.trains import lumped
+
+FOLDER = Path(__file__).with_name("scenarios")
+# Key of the table that chooses the train's model, and the file of each.
+MODELS = {"lumped": lumped}
+
+
+class ScenarioError(ValueError):
+    """The scenario is unknown or wrong; the message names file, key and what was expected."""
+
+
+class Sensors(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Sensors; 0 turns a property off."""
+
+    location: str = "front"  # front | mean (of front and rear)
+    position_step_m: float = 0.0  # quantisation on top of the DBC's
+    speed_step_m_s: float = 0.0
+    speed_noise_m_s: float = 0.0  # standard deviation, white
+
+    def __post_init__(self) -> None:
+        if self.location not in ("front", "mean"):
+            raise ValueError(f"location is {self.location!r}, expected front or mean")
+
+
+class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Load disturbance, uniform, new in each run."""
+
+    amplitude_m_s2: float = 0.0
+    hold_ticks: int = 1  # a value stays for so many ticks
+
+
+class Metrics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"from_s": "from", "to_s": "to"}):
+    """Window of the errors in the summary, seconds; the whole run by default."""
+
+    from_s: float = 0.0
+    to_s: float = float("inf")
+
+
+class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The controller's settings that do not belong to one law; checked by the controller's calibration."""
+
+    preview_ticks: int = 0  # the reference acceleration is read this far ahead
+    distribute: bool = False  # give each car a force of its own
+    memory: dict[str, Any] = {}
+    guard: dict[str, Any] = {}
+
+
+class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """All of a scenario, as validated."""
+
+    title: str
+    law: str  # default law
+    runs: int  # default number of runs
+    period_s: float  # control period
+    train: lumped.Train
+    profile: ProfilePlan
+    actuator: Actuator
+    laws: dict[str, dict[str, Any]]  # gains of each law that the scenario supports
+    track: Track = Track()
+    sensors: Sensors = Sensors()
+    disturbance: Disturbance = Disturbance()
+    control: Control = Control()
+    metrics: Metrics = Metrics()
+    base: str = ""
+
+
+class Loaded(msgspec.Struct, frozen=True):
+    """A scenario with what follows from it."""
+
+    name: str
+    path: Path
+    digest: str  # of the merged content
+    scenario: Scenario
+    segments: np.ndarray  # profile.SEGMENT
+    profile: Profile
+
+    @property
+    def ticks(self) -> int:
+        """Control periods of a run."""
+        return len(self.profile.x)
+
+
+def scenario_names() -> list[str]:
+    """Names of the packaged scenarios, sorted."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def find(name: str) -> Path:
+    """File of a scenario, by name or path. Raises ScenarioError if there is none."""
+    if name.endswith(".toml"):
+        path = Path(name)
+        if not path.is_file():
+            raise ScenarioError(f"{name}: no such scenario file")
+        return path
+    path = FOLDER / f"{name}.toml"
+    if not path.is_file():
+        raise ScenarioError(
+            f"scenario {name!r} is unknown, expected one of {', '.join(scenario_names())}, or a .toml file"
+        )
+    return path
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: not valid TOML: {error}") from None
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """`over` on top of `base`, table by table; lists are replaced whole."""
+    result = dict(base)
+    for key, value in over.items():
+        both_tables = isinstance(value, dict) and isinstance(result.get(key), dict)
+        result[key] = _merged(result[key], value) if both_tables else value
+    return result
+
+
+def _content(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
+    if path in seen:
+        raise ScenarioError(f"{path}: key `base` leads back to itself")
+    content = _read(path)
+    base = content.get("base", "")
+    if not isinstance(base, str):
+        raise ScenarioError(f"{path}: key `base`: expected the name of a scenario")
+    if base:
+        try:
+            below = find(base)
+        except ScenarioError as error:
+            raise ScenarioError(f"{path}: key `base`: {error}") from None
+        content = _merged(_content(below, (*seen, path)), content)
+    return content
+
+
+@lru_cache(maxsize=32)
+def load(name: str) -> Loaded:
+    """A scenario by name or path, validated and planned. Raises ScenarioError with one line."""
+    path = find(name)
+    content = _content(path)
+    try:
+        scenario = msgspec.convert(content, Scenario)
+    except msgspec.ValidationError as error:
+        raise ScenarioError(f"{path}: {_where(str(error))}") from None
+    _check(path, scenario)
+    try:
+        segments = plan_profile(scenario.profile, scenario.period_s)
+        profile = evaluate(segments, scenario.period_s)
+    except (PlanError, ValueError) as error:
+        raise ScenarioError(f"{path}: [profile]: {error}") from None
+    digest = hashlib.blake2b(msgspec.json.encode(content, order="deterministic"), digest_size=16)
+    return Loaded(path.stem, path, digest.hexdigest(), scenario, segments, profile)
+
+
+def _where(message: str) -> str:
+    """The validator's message with the key first: `train.masses_kg: Expected ...`."""
+    text, _, place = message.partition(" - at `$.")
+    return f"key {place.rstrip('`')}: {text}" if place else text
+
+
+def _check(path: Path, scenario: Scenario) -> None:
+    """What types cannot say."""
+    cars = len(scenario.train.masses_kg)
+    if not 1 <= cars <= lumped.CARS_MAX:
+        raise ScenarioError(f"{path}: key train.masses_kg: {cars} cars, expected 1 to {lumped.CARS_MAX}")
+    for key in ("effectiveness",):
+        if len(getattr(scenario.train, key)) != cars:
+            raise ScenarioError(f"{path}: key train.{key}: expected {cars} numbers, one a car")
+    for key in ("coupler_sine_m", "coupler_cosine_m"):
+        if len(getattr(scenario.train, key)) != cars - 1:
+            raise ScenarioError(f"{path}: key train.{key}: expected {cars - 1} numbers, one a coupler")
+    if scenario.law not in scenario.laws:
+        raise ScenarioError(f"{path}: key law: {scenario.law!r} has no gains, expected a table [laws.{scenario.law}]")
+    if scenario.runs < 1:
+        raise ScenarioError(f"{path}: key runs: {scenario.runs}, expected 1 or more")
+    if not scenario.profile.limits:
+        raise ScenarioError(f"{path}: key profile.limits: expected at least one limit")

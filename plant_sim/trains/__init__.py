@@ -1,0 +1,1 @@
+"""Train dynamics, one model a file."""

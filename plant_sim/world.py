@@ -1,0 +1,111 @@
+"""A plant ready to run: the compiled steps with their buffers, and the chance of each run.
+
+The same object serves the plant process (HIL), the single-process loop (SIL) and the interpreted run (MIL).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from can_dbc.codec import mailboxes
+from can_dbc.step import INTERPRETED
+from plant_sim import actuator, plant, track
+from plant_sim.scenario import MODELS, Loaded
+
+# Chance: what a random number is drawn for; each gets a stream of its own.
+SPEED_NOISE, DISTURBANCE = 0, 1
+
+
+@dataclass
+class World:
+    """Buffers of one plant; `params` and `state` are the single records of their arrays."""
+
+    loaded: Loaded
+    seed: int
+    begin: Any
+    sense: Any
+    actuate_and_advance: Any
+    params: Any
+    state: Any
+    limits: Any  # [n] of plant.LIMIT
+    track: Any  # [n] of track.SECTION
+    rx: Any  # mailboxes
+    tx: Any
+
+
+def rows(array: np.ndarray) -> Any:
+    """A structured array in the form that steps take."""
+    return array.view(np.recarray) if INTERPRETED else array
+
+
+def build(loaded: Loaded, seed: int) -> World:
+    """The plant of a scenario."""
+    scenario = loaded.scenario
+    train = scenario.train
+    model = MODELS["lumped"]
+    smeared = scenario.track.application == "smeared"
+    params = np.zeros(1, plant.params_dtype(model.PARAMS))
+    params["train"] = model.calibrate(train, scenario.period_s, smeared)
+    params["actuator"] = actuator.calibrate(
+        scenario.actuator, train.mass_kg, scenario.period_s, scenario.period_s / train.substeps
+    )
+    node = params["node"]
+    cars = len(train.masses_kg)
+    node["cars"] = cars if scenario.control.distribute else 0
+    node["effectiveness"][0, :cars] = train.effectiveness
+    node["position_step_m"] = scenario.sensors.position_step_m
+    node["speed_step_m_s"] = scenario.sensors.speed_step_m_s
+    node["speed_noise_m_s"] = scenario.sensors.speed_noise_m_s
+    node["rear_weight"] = 0.5 if scenario.sensors.location == "mean" else 0.0
+    node["rear_offset_m"] = train.pitch_m * (cars - 1)
+
+    limits = np.zeros(len(scenario.profile.limits), plant.LIMIT)
+    for row, limit in zip(limits, scenario.profile.limits, strict=True):
+        row["until_tick"] = round(limit.until_s / scenario.period_s)
+        row["speed_m_s"] = limit.speed_m_s
+    state = np.zeros(1, plant.state_dtype(model.STATE))
+    begin, sense, actuate_and_advance = plant.build(model)
+    return World(
+        loaded=loaded,
+        seed=seed,
+        begin=begin,
+        sense=sense,
+        actuate_and_advance=actuate_and_advance,
+        params=rows(params)[0],
+        state=rows(state)[0],
+        limits=rows(limits),
+        track=rows(track.sections(scenario.track)),
+        rx=rows(mailboxes()),
+        tx=rows(mailboxes()),
+    )
+
+
+def _bits(seed: int, run: int, stream: int, count: int) -> np.ndarray:
+    """`count` random 64-bit words, a function of seed, run and stream alone."""
+    generator = np.random.Philox(key=[seed, (run << 8) + stream])
+    return np.asarray(generator.random_raw(count), np.uint64)
+
+
+def _uniform(words: np.ndarray) -> np.ndarray:
+    """[0, 1) from the top 53 bits; exact, so that it is the same on every machine."""
+    return (words >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+
+def chance(loaded: Loaded, seed: int, run: int) -> np.ndarray:
+    """Random numbers of a run, [ticks] of plant.CHANCE; only what the scenario uses is drawn."""
+    ticks = loaded.ticks
+    drawn = np.zeros(ticks, plant.CHANCE)
+    if loaded.scenario.sensors.speed_noise_m_s > 0:
+        # Sum of twelve uniforms: variance 1, no logarithm whose last bit depends on the machine.
+        words = _bits(seed, run, SPEED_NOISE, 12 * ticks).reshape(ticks, 12)
+        drawn["speed_noise"] = _uniform(words).sum(axis=1) - 6.0
+    disturbance = loaded.scenario.disturbance
+    if disturbance.amplitude_m_s2 > 0:
+        values = -(-ticks // disturbance.hold_ticks)
+        uniform = _uniform(_bits(seed, run, DISTURBANCE, values))
+        held = np.repeat(2.0 * uniform - 1.0, disturbance.hold_ticks)[:ticks]
+        drawn["disturbance_m_s2"] = disturbance.amplitude_m_s2 * held
+    return drawn

@@ -1,0 +1,311 @@
+"""Names of buses, their errors, and mailbox frames on any bus of python-can."""
+
+import errno
+import os
+import socket
+from types import SimpleNamespace
+
+import can
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from can_dbc import bus as bus_module
+from can_dbc.bus import (
+    FOREIGN,
+    BusChoice,
+    BusError,
+    choose_bus,
+    open_bus,
+    private_vcan_reason,
+    recv_frames,
+    send_frames,
+    socketcan_reason,
+)
+from can_dbc.hub import HubBus
+
+TIMEOUT_S = 10.0
+
+
+class CanSocket:
+    """Stands for a raw CAN socket of a kernel that has the interfaces in `up` and `down`."""
+
+    up: tuple[str, ...] = ()
+    down: tuple[str, ...] = ()
+
+    def __init__(self, family: int, kind: int, protocol: int) -> None:
+        assert (family, kind) == (socket.AF_CAN, socket.SOCK_RAW)
+        self.name = ""
+
+    def __enter__(self) -> "CanSocket":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        pass
+
+    def bind(self, address: tuple[str]) -> None:
+        (self.name,) = address
+        if self.name and self.name not in self.up + self.down:
+            raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+
+    def getsockopt(self, level: int, option: int) -> int:
+        assert (level, option) == (socket.SOL_SOCKET, socket.SO_ERROR)
+        return errno.ENETDOWN if self.name in self.down else 0
+
+
+@pytest.fixture
+def can_kernel_without_vcan0(monkeypatch):
+    monkeypatch.setattr(socket, "AF_CAN", 29, raising=False)  # not there on every system
+    monkeypatch.setattr(socket, "CAN_RAW", 1, raising=False)
+    monkeypatch.setattr(socket, "socket", CanSocket)
+
+
+@pytest.fixture
+def can_kernel(can_kernel_without_vcan0, monkeypatch):
+    """A kernel with an interface vcan0 and an interface can7 that is down."""
+    monkeypatch.setattr(CanSocket, "up", ("vcan0",))
+    monkeypatch.setattr(CanSocket, "down", ("can7",))
+
+
+@pytest.fixture
+def no_can_kernel(can_kernel_without_vcan0, monkeypatch):
+    def refuse(*arguments: int) -> None:
+        raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
+
+    monkeypatch.setattr(socket, "socket", refuse)
+
+
+# Which bus a name stands for
+
+
+@pytest.mark.parametrize(
+    ("name", "interface", "channel", "resolved"),
+    [
+        ("hub", "atohub", "vcan0", "hub:vcan0"),
+        ("hub:train2", "atohub", "train2", "hub:train2"),
+        ("atohub:train2", "atohub", "train2", "hub:train2"),
+        ("virtual:x", "virtual", "x", "virtual:x"),
+        ("udp_multicast:ff15::1", "udp_multicast", "ff15::1", "udp_multicast:ff15::1"),
+    ],
+)
+def test_names(name, interface, channel, resolved):
+    choice = choose_bus(name)
+    assert choice == BusChoice(interface, channel, "asked for")
+    assert choice.name == resolved
+    assert choose_bus(resolved) == choice
+
+
+def test_auto_takes_vcan0(can_kernel):
+    choice = choose_bus("auto")
+    assert choice.name == "socketcan:vcan0"
+    assert choice.reason == "vcan0 exists"
+    assert choose_bus(choice.name).name == choice.name
+
+
+def test_auto_takes_the_hub_without_vcan0(can_kernel_without_vcan0):
+    choice = choose_bus("auto")
+    assert choice.name == "hub:vcan0"
+    assert "there is no network interface 'vcan0' for CAN" in choice.reason
+    assert private_vcan_reason() in choice.reason
+
+
+def test_auto_takes_the_hub_without_can(no_can_kernel):
+    assert choose_bus("auto") == BusChoice("atohub", "vcan0", "this kernel has no SocketCAN")
+
+
+def test_auto_takes_the_hub_where_there_is_no_address_family(monkeypatch):
+    monkeypatch.delattr(socket, "AF_CAN", raising=False)
+    assert choose_bus("auto") == BusChoice("atohub", "vcan0", "this system has no SocketCAN")
+
+
+# Why not
+
+
+@pytest.mark.parametrize(
+    "name", ["", "hub:", ":x", "virtual", "virtual:", "socketcan", "socketcan:"]
+)
+def test_malformed_names(name):
+    with pytest.raises(BusError) as failure:
+        open_bus(name)
+    assert str(failure.value) == (
+        f"bus {name!r}: expected auto, hub, hub:CHANNEL, vcan, socketcan:NAME or INTERFACE:CHANNEL"
+    )
+
+
+def test_an_unknown_interface():
+    with pytest.raises(
+        BusError, match=r"^bus 'carrier:pigeon': unknown interface 'carrier'.* pcan,"
+    ):
+        open_bus("carrier:pigeon")
+
+
+def test_an_interface_that_is_missing(can_kernel):
+    with pytest.raises(BusError) as failure:
+        open_bus("socketcan:can9")
+    assert str(failure.value) == (
+        "bus 'socketcan:can9': there is no network interface 'can9' for CAN"
+    )
+
+
+def test_an_interface_that_is_down(can_kernel):
+    with pytest.raises(BusError) as failure:
+        open_bus("socketcan:can7")
+    assert str(failure.value) == (
+        "bus 'socketcan:can7': network interface 'can7' is down, try: sudo ip link set up can7"
+    )
+
+
+def test_socketcan_without_can(no_can_kernel):
+    with pytest.raises(BusError, match=r"^bus 'socketcan:vcan0': this kernel has no SocketCAN$"):
+        open_bus("socketcan:vcan0")
+
+
+@pytest.mark.parametrize("channel", ["nosuchcan0", "x" * 40])
+def test_a_missing_interface_on_this_machine(channel):
+    with pytest.raises(BusError, match=f"^bus 'socketcan:{channel}': "):
+        open_bus(f"socketcan:{channel}")
+
+
+def test_vcan_says_why_not():
+    reason = private_vcan_reason()
+    assert reason
+    assert "\n" not in reason
+    with pytest.raises(BusError) as failure:
+        open_bus("vcan")
+    assert str(failure.value) == f"bus 'vcan': cannot have a private vcan: {reason}"
+
+
+@pytest.mark.parametrize(
+    ("release", "file", "text", "known"),
+    [
+        (
+            "modules.dep",
+            True,
+            "kernel/drivers/net/can/vcan.ko.xz: kernel/net/can/can.ko.xz\n",
+            True,
+        ),
+        ("modules.builtin", True, "kernel/drivers/net/can/vcan.ko\n", True),
+        ("modules.dep", True, "kernel/drivers/net/can/vxcan.ko: kernel/net/can/can.ko\n", False),
+        ("modules.dep", False, "", False),
+    ],
+)
+def test_the_module_vcan_is_looked_for(
+    can_kernel_without_vcan0, monkeypatch, tmp_path, release, file, text, known
+):
+    if file:
+        (tmp_path / release).write_text(text)
+    real_path = bus_module.Path
+
+    def moved(*parts: str) -> object:
+        return tmp_path if parts[0] == "/lib/modules" else real_path(tmp_path, "not there")
+
+    monkeypatch.setattr(bus_module, "Path", moved)
+    assert (private_vcan_reason() == "this kernel has no module vcan") is not known
+
+
+def test_a_driver_that_raises_gives_one_line(monkeypatch):
+    def fail(*arguments: object, **options: object) -> None:
+        raise RuntimeError("first line\n  second line")
+
+    monkeypatch.setattr(can, "Bus", fail)
+    with pytest.raises(BusError) as failure:
+        open_bus("virtual:x")
+    assert str(failure.value) == "bus 'virtual:x': cannot open virtual:x: first line second line"
+
+
+def test_a_hub_channel_that_cannot_be():
+    with pytest.raises(BusError, match=r"^bus 'hub:a/b': cannot open hub:a/b: .*expected letters"):
+        open_bus("hub:a/b")
+
+
+# Opening
+
+
+def test_open_hub(runtime_dir):
+    with open_bus("hub:x", receive_own_messages=True) as bus:
+        assert isinstance(bus, HubBus)
+        send_frames(bus, [(1, -1)])
+        assert recv_frames(bus, TIMEOUT_S) == [(1, -1)]
+
+
+def test_configuration_files_do_not_count(monkeypatch, tmp_path):
+    (tmp_path / "can.ini").write_text(
+        "[default]\ninterface = virtual\nreceive_own_messages = True\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    with open_bus("virtual:ini") as bus:
+        send_frames(bus, [(1, 1)])
+        assert recv_frames(bus, 0) == []
+
+
+def test_the_receive_buffer_is_enlarged():
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
+        before = own.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        bus_module._enlarge_receive_buffer(SimpleNamespace(socket=own))
+        assert own.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) >= before
+
+
+def test_the_receive_buffer_is_enlarged_without_root():
+    calls = []
+
+    def setsockopt(level: int, option: int, value: int) -> None:
+        if option == bus_module._SO_RCVBUFFORCE:
+            raise PermissionError
+        calls.append((level, option))
+        assert value > 10**7
+
+    fake = SimpleNamespace(socket=SimpleNamespace(setsockopt=setsockopt))
+    bus_module._enlarge_receive_buffer(fake)
+    assert calls == [(socket.SOL_SOCKET, socket.SO_RCVBUF)]
+
+
+def test_a_name_too_long_for_an_interface():
+    assert socketcan_reason("x" * 40)
+
+
+# Mailbox frames on a bus without the fast path
+
+
+FRAMES = st.lists(st.tuples(st.integers(0, 0x7FF), st.integers(-(2**63), 2**63 - 1)), max_size=20)
+
+
+@given(frames=FRAMES)
+def test_mailbox_frames_on_a_plain_bus(frames):
+    with open_bus("virtual:plain") as sender, open_bus("virtual:plain") as receiver:
+        send_frames(sender, frames)
+        assert recv_frames(receiver, 0) == frames
+        assert recv_frames(receiver, 0) == []
+
+
+def test_recv_frames_of_a_plain_bus_returns_under_load():
+    with open_bus("virtual:load") as sender, open_bus("virtual:load") as receiver:
+        send_frames(sender, [(1, count) for count in range(3000)])
+        lengths = [len(recv_frames(receiver, 0)) for _ in range(4)]
+    assert sum(lengths) == 3000
+    assert max(lengths) < 3000
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        {"is_extended_id": True, "data": bytes(8)},
+        {"is_remote_frame": True, "dlc": 8},
+        {"is_error_frame": True, "data": bytes(8)},
+        {"data": b"\1\2"},
+        {"is_fd": True, "data": bytes(8)},
+        {"is_fd": True, "data": b"\xff" * 64},
+    ],
+    ids=["extended", "remote", "error", "short", "fd", "long"],
+)
+def test_odd_frames_look_the_same_on_every_bus(runtime_dir, kind):
+    message = can.Message(arbitration_id=5, **{"is_extended_id": False} | kind)
+    seen = []
+    for name in ("virtual:odd", "hub:odd"):
+        with open_bus(name, fd=True) as sender, open_bus(name, fd=True) as receiver:
+            sender.send(message)
+            seen.append(recv_frames(receiver, TIMEOUT_S))
+    assert seen[0] == seen[1]
+    ((can_id, _),) = seen[0]
+    assert can_id & FOREIGN
+    assert can_id & 0x7FF == 5

@@ -1,0 +1,85 @@
+"""Recorded frames: one row a frame in bus order, decoded by whole columns.
+
+A recording is an array of FRAME rows for each run. Its digest stands for every bit that was on the
+bus: two runs that behaved alike have the same digest, whichever bus carried them.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import xxhash
+
+from can_dbc.codec import ATO_ESTIMATE, database, decode_column
+
+FRAME = np.dtype(
+    [
+        ("tick", np.int32),  # control period inside the run, from 0
+        ("frame_id", np.int32),  # CAN identifier
+        ("payload", np.int64),  # mailbox word: the eight bytes, little-endian
+    ]
+)
+
+
+class Digest:
+    """Hash over the rows of a recording, in order, however they are cut into batches."""
+
+    def __init__(self) -> None:
+        self._hash = xxhash.xxh3_128()
+
+    def update(self, frames: np.ndarray) -> None:
+        """Add FRAME rows. Raises ValueError for rows of another type."""
+        if frames.dtype != FRAME:
+            raise ValueError(f"digest of {frames.dtype}: expected rows of {FRAME}")
+        self._hash.update(np.ascontiguousarray(frames).view(np.uint8).data)
+
+    def hex(self) -> str:
+        """XXH3-128 of all rows so far, 32 hexadecimal digits."""
+        return self._hash.hexdigest()
+
+
+def columns(frames: np.ndarray, message: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Ticks (int32) and mailbox words (int64) of all frames of one message of `codec.MESSAGES`."""
+    rows = np.flatnonzero(frames["frame_id"] == message.frame_id)
+    return frames["tick"][rows], frames["payload"][rows]
+
+
+def decode(frames: np.ndarray, message: Any, signal: str) -> tuple[np.ndarray, np.ndarray]:
+    """Ticks (int32) and physical values (float64, unit of the DBC) of one signal, one a frame.
+
+    Of a multiplexed signal, only the frames that carry it.
+    """
+    ticks, words = columns(frames, message)
+    selector = _selector(message.name, signal)
+    if selector:
+        multiplexer, value = selector
+        carried = decode_column(words, getattr(message, multiplexer)) == value
+        ticks, words = ticks[carried], words[carried]
+    return ticks, physical(words, message, signal)
+
+
+def physical(words: np.ndarray, message: Any, signal: str) -> np.ndarray:
+    """Physical values (float64, unit of the DBC) of one signal in a column of mailbox words."""
+    layout = getattr(message, signal)
+    return decode_column(words, layout) * layout.scale
+
+
+def estimate(frames: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Ticks (int32) and values (float64) of estimate `index` (0..9): raw · 2^-Exponent."""
+    ticks, words = columns(frames, ATO_ESTIMATE)
+    carried = decode_column(words, ATO_ESTIMATE.Index) == index
+    ticks, words = ticks[carried], words[carried]
+    raw = decode_column(words, getattr(ATO_ESTIMATE, f"Estimate{index}"))
+    exponent = decode_column(words, ATO_ESTIMATE.Exponent)
+    return ticks, np.ldexp(raw.astype(np.float64), -exponent)
+
+
+@cache
+def _selector(message: str, signal: str) -> tuple[str, int] | None:
+    """The multiplexer signal and the value of it at which a frame carries `signal`, if any."""
+    source = database().get_message_by_name(message).get_signal_by_name(signal)
+    if not source.multiplexer_ids:
+        return None
+    return str(source.multiplexer_signal), source.multiplexer_ids[0]

@@ -1,0 +1,202 @@
+"""HIL: recorder, controller and plant as processes of their own on one bus; this process starts, watches and ends them.
+
+A process that dies, a node that falls silent or Ctrl-C ends the run within two seconds, names the cause, keeps the traces so far, and
+leaves no process and no socket behind.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from controller import calibration as calibrations
+from controller.calibration import Calibration
+
+READY_TIMEOUT_S = 300.0  # the first start compiles
+STOP_TIMEOUT_S = 0.7  # of a node that was asked to end
+
+
+class RunError(Exception):
+    """A run ended early; one line that names the cause."""
+
+
+@dataclass
+class Node:
+    """A child process and what it has said."""
+
+    name: str
+    process: subprocess.Popen[str]
+    log: Path
+    said: dict[str, dict[str, Any]] = field(default_factory=dict)  # last event of each kind
+
+    def command(self, **fields: Any) -> None:
+        """One JSON line to the node; a node that is gone is noticed elsewhere."""
+        try:
+            assert self.process.stdin is not None
+            self.process.stdin.write(json.dumps(fields) + "\n")
+            self.process.stdin.flush()
+        except (BrokenPipeError, ValueError):
+            pass
+
+
+class Bench:
+    """The three nodes of one run. Use as a context manager: leaving it ends every node."""
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self.nodes: dict[str, Node] = {}
+        self.events: queue.Queue[tuple[Node, dict[str, Any]]] = queue.Queue()
+
+    def __enter__(self) -> Bench:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def start(self, name: str, arguments: list[str]) -> Node:
+        """A child process that speaks JSON lines; its stderr goes to OUT/NAME.log."""
+        log = self.out / f"{name}.log"
+        with ExitStack() as stack:
+            errors = stack.enter_context(open(log, "w", encoding="utf-8"))
+            process = subprocess.Popen(
+                [sys.executable, "-m", *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+                start_new_session=True,  # Ctrl-C comes to this process alone
+            )
+        node = Node(name, process, log)
+        self.nodes[name] = node
+        assert process.stdout is not None
+        threading.Thread(target=self._listen, args=(node, process.stdout), daemon=True).start()
+        return node
+
+    def _listen(self, node: Node, stream: IO[str]) -> None:
+        for line in stream:
+            if line.startswith("{"):
+                self.events.put((node, json.loads(line)))
+        self.events.put((node, {"event": "closed"}))
+
+    def next_event(self, timeout_s: float) -> tuple[Node, dict[str, Any]] | None:
+        """The next event of any node, None after `timeout_s`. Raises RunError for an error or a node that died."""
+        try:
+            node, event = self.events.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+        node.said[event["event"]] = event
+        if event["event"] == "error":
+            raise RunError(event["message"])
+        if event["event"] == "closed":
+            code = node.process.wait()
+            if "done" not in node.said:
+                raise RunError(f"the {node.name} process ended ({_exit_text(code)}){_last_line(node)}")
+        return node, event
+
+    def wait_ready(self) -> None:
+        """Until every node has said that it is ready."""
+        deadline = time.monotonic() + READY_TIMEOUT_S
+        while any("ready" not in node.said for node in self.nodes.values()):
+            self.next_event(0.5)
+            if time.monotonic() > deadline:
+                late = [node.name for node in self.nodes.values() if "ready" not in node.said]
+                raise RunError(f"{', '.join(late)} not ready within {READY_TIMEOUT_S:g} s")
+
+    def end(self) -> None:
+        """Ends plant and controller, then the recorder, which writes what it has; kills what does not end."""
+        for name in ("plant", "controller"):
+            self._end(name, STOP_TIMEOUT_S)
+        recorder = self.nodes.get("recorder")
+        if recorder is not None and recorder.process.poll() is None:
+            recorder.command(command="stop")
+        self._end("recorder", 30.0, terminate=False)
+
+    def _end(self, name: str, timeout_s: float, terminate: bool = True) -> None:
+        node = self.nodes.get(name)
+        if node is None:
+            return
+        if terminate and node.process.poll() is None:
+            node.process.terminate()
+        try:
+            node.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            node.process.kill()
+            node.process.wait()
+        for stream in (node.process.stdin, node.process.stdout):
+            if stream is not None:
+                try:
+                    stream.close()
+                except BrokenPipeError:
+                    pass
+
+
+def _exit_text(code: int) -> str:
+    return f"signal {-code}" if code < 0 else f"exit status {code}"
+
+
+def _last_line(node: Node) -> str:
+    lines = node.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return f": {lines[-1]}" if lines else ""
+
+
+def flash(calibration: Calibration, folder: Path) -> Path:
+    """The calibration as a file for the controller process."""
+    path = folder / "calibration.npz"
+    calibrations.save(calibration, path)
+    return path
+
+
+def run(
+    *,
+    scenario: str,
+    calibration: Calibration,
+    bus: str,
+    runs: int,
+    seed: int,
+    out: Path,
+    memory_file: Path | None,
+    recorder_arguments: list[str],
+) -> Iterator[tuple[Node, dict[str, Any], Bench]]:
+    """Events of the nodes until all runs are done and recorded; see the `tell` calls of the processes.
+
+    Raises RunError with one line if a node dies, falls silent or reports an error.
+    """
+    with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, Bench(out) as bench:
+        calibration_file = flash(calibration, Path(scratch))
+        recorder = bench.start("recorder", ["tools.recorder", "--bus", bus, *recorder_arguments])
+        controller_arguments = ["--calibration", str(calibration_file), "--bus", bus]
+        if memory_file is not None:
+            controller_arguments += ["--memory", str(memory_file)]
+        bench.start("controller", ["controller.process", *controller_arguments])
+        plant = bench.start(
+            "plant",
+            [
+                "plant_sim.process",
+                *("--scenario", scenario),
+                *("--bus", bus),
+                *("--seed", str(seed)),
+                *("--runs", str(runs)),
+                *("--out", scratch),
+            ],
+        )
+        bench.wait_ready()
+        plant.command(command="start")
+        recorded = 0
+        while recorded < runs:
+            got = bench.next_event(0.5)
+            if got is None:
+                continue
+            node, event = got
+            if node is recorder and event["event"] == "run":
+                recorded += 1
+            yield node, event, bench

@@ -1,0 +1,53 @@
+"""From a scenario to a calibrated controller: the only place that knows both sides."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from controller.calibration import Calibration, GuardSettings, MemorySettings, calibrate
+from controller.quantise import CalibrationError, Vehicle
+from plant_sim.scenario import Loaded, ScenarioError
+
+
+def calibration_for(loaded: Loaded, law: str) -> Calibration:
+    """What the controller is flashed with for one law. Raises ScenarioError with file and key."""
+    scenario = loaded.scenario
+    if law not in scenario.laws:
+        known = ", ".join(sorted(scenario.laws))
+        raise ScenarioError(f"{loaded.path}: no gains for law {law!r}, the scenario has {known}")
+    distribute = scenario.control.distribute
+    try:
+        return calibrate(
+            law=law,
+            gains=scenario.laws[law],
+            vehicle=Vehicle(
+                scenario.train.mass_kg, scenario.period_s, scenario.actuator.force_max_m_s2
+            ),
+            profile=loaded.segments,
+            preview_ticks=scenario.control.preview_ticks,
+            memory_settings=_settings("control.memory", scenario.control.memory, MemorySettings),
+            guard_settings=_settings("control.guard", scenario.control.guard, GuardSettings),
+            car_effectiveness=list(scenario.train.effectiveness) if distribute else [],
+            motor_cars=list(scenario.train.motor_cars),
+            scenario_digest=loaded.digest,
+        )
+    except CalibrationError as error:
+        raise ScenarioError(f"{loaded.path}: {error}") from None
+
+
+def _settings(key: str, values: dict[str, Any], kind: Any) -> Any:
+    try:
+        return msgspec.convert(values, kind)
+    except msgspec.ValidationError as error:
+        raise CalibrationError(f"{key}: {error}") from None
+
+
+def error_weight(loaded: Loaded, law: str) -> float | None:
+    """alpha of the augmented error: the law's own, else that of the scenario's default law, else None."""
+    for name in (law, loaded.scenario.law):
+        alpha = loaded.scenario.laws[name].get("alpha")
+        if alpha is not None:
+            return float(alpha)
+    return None

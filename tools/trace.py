@@ -1,0 +1,551 @@
+"""A Rerun trace of the bus: DIR/trace.rrd.
+
+What is logged is what was on the bus, decoded by whole columns, with the true state of the plant
+beside it in a branch of its own:
+
+    /bus/PLOT/run_NN        signals of one plot, a vector a tick, units of the DBC
+    /bus/state/run_NN/LANE  states and faults, a row a change
+    /bus/frames/run_NN      every frame of a tick as it was: identifiers and payloads
+    /truth/FIELD/run_NN     true state of the plant, and its errors against the reference
+    /reference/FIELD        the reference
+    /runs/KEY               the summary of each run, on timeline `run`
+    /events                 texts
+
+Timelines: `tick` (control period inside the run), `time` (simulated time inside the run), `run`.
+Runs share the first two, so that a view that takes a plot of several runs overlays them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from can_dbc.codec import (
+    ATO_STATUS,
+    ATO_TRACKING,
+    ATP_LIMIT,
+    CAR_FORCE_1,
+    CAR_FORCE_2,
+    CAR_FORCE_3,
+    CAR_FORCE_4,
+    FORCE_CMD,
+    MESSAGES,
+    NEIGHBOUR_AHEAD_MOTION,
+    NEIGHBOUR_AHEAD_POSITION,
+    NEIGHBOUR_BEHIND_MOTION,
+    NEIGHBOUR_BEHIND_POSITION,
+    RUN_CTRL,
+    TRAIN_POSITION,
+    TRAIN_SPEED,
+    database,
+    decode_column,
+)
+from controller.interface import fault_names
+from tools.frames import columns, estimate, physical
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+MAX_CARS = 8
+
+Colour = tuple[int, int, int]
+BLUE: Colour = (86, 180, 233)
+ORANGE: Colour = (240, 160, 40)
+RED: Colour = (225, 75, 60)
+PINK: Colour = (220, 140, 180)
+GREEN: Colour = (40, 180, 130)
+YELLOW: Colour = (240, 228, 66)
+GREY: Colour = (150, 150, 150)
+VIOLET: Colour = (150, 120, 220)
+
+# A run's colour, from the first run to the last: the eye sees learning as a change of colour.
+RUN_RAMP: tuple[Colour, ...] = (VIOLET, RED, ORANGE, YELLOW)
+CAR_COLOURS: tuple[Colour, ...] = (GREY, BLUE, GREEN, YELLOW, ORANGE, RED, PINK, VIOLET)
+
+
+class Line(NamedTuple):
+    """One signal in a plot."""
+
+    message: Any  # of codec.MESSAGES
+    signal: str
+    label: str
+    colour: Colour
+
+
+class Plot(NamedTuple):
+    """Signals with one unit and one cycle time: one entity with a vector of scalars."""
+
+    name: str
+    unit: str
+    lines: tuple[Line, ...]
+
+
+PLOTS = (
+    Plot(
+        "speed",
+        "m/s",
+        (
+            Line(TRAIN_SPEED, "Speed", "measured", BLUE),
+            Line(ATP_LIMIT, "TargetSpeed", "target", PINK),
+            Line(ATP_LIMIT, "PermittedSpeed", "permitted", RED),
+        ),
+    ),
+    Plot("position", "m", (Line(TRAIN_POSITION, "Position", "measured", BLUE),)),
+    Plot("acceleration", "m/s²", (Line(TRAIN_SPEED, "Acceleration", "measured", BLUE),)),
+    Plot("force", "N", (Line(FORCE_CMD, "Force", "commanded", BLUE),)),
+    Plot("target_distance", "m", (Line(ATP_LIMIT, "TargetDistance", "to target", PINK),)),
+    Plot("position_error", "m", (Line(ATO_TRACKING, "PositionError", "controller", BLUE),)),
+    Plot("speed_error", "m/s", (Line(ATO_TRACKING, "SpeedError", "controller", BLUE),)),
+    Plot(
+        "tick",
+        "",
+        (
+            Line(TRAIN_POSITION, "Tick", "sent", BLUE),
+            Line(FORCE_CMD, "Tick", "echoed", ORANGE),
+        ),
+    ),
+    Plot(
+        "iteration",
+        "",
+        (
+            Line(RUN_CTRL, "Iteration", "plant", BLUE),
+            Line(ATO_STATUS, "Iteration", "controller", ORANGE),
+        ),
+    ),
+    Plot(
+        "neighbour_position",
+        "m",
+        (
+            Line(NEIGHBOUR_AHEAD_POSITION, "Position", "ahead", GREEN),
+            Line(NEIGHBOUR_BEHIND_POSITION, "Position", "behind", VIOLET),
+        ),
+    ),
+    Plot(
+        "neighbour_age",
+        "s",
+        (
+            Line(NEIGHBOUR_AHEAD_POSITION, "Age", "ahead", GREEN),
+            Line(NEIGHBOUR_BEHIND_POSITION, "Age", "behind", VIOLET),
+        ),
+    ),
+    Plot(
+        "neighbour_speed",
+        "m/s",
+        (
+            Line(NEIGHBOUR_AHEAD_MOTION, "Speed", "ahead", GREEN),
+            Line(NEIGHBOUR_BEHIND_MOTION, "Speed", "behind", VIOLET),
+            Line(NEIGHBOUR_AHEAD_MOTION, "OffsetSpeed", "ahead, re-based", YELLOW),
+            Line(NEIGHBOUR_BEHIND_MOTION, "OffsetSpeed", "behind, re-based", PINK),
+        ),
+    ),
+)
+
+CAR_FORCES = (CAR_FORCE_1, CAR_FORCE_2, CAR_FORCE_3, CAR_FORCE_4)  # two cars each
+
+
+class Lane(NamedTuple):
+    """A signal whose value is a state: shown as a coloured lane, logged when it changes."""
+
+    name: str
+    message: Any  # of codec.MESSAGES
+    signal: str
+
+
+LANES = (
+    Lane("mode", FORCE_CMD, "Mode"),
+    Lane("supervision", ATP_LIMIT, "Supervision"),
+    Lane("guard", ATO_STATUS, "Guard"),
+    Lane("faults", ATO_STATUS, "Faults"),
+    Lane("sensor", TRAIN_SPEED, "Quality"),
+    Lane("law", ATO_STATUS, "Law"),
+    Lane("run_plant", RUN_CTRL, "RunState"),
+    Lane("run_controller", ATO_STATUS, "RunState"),
+    Lane("pace", RUN_CTRL, "Pace"),
+    Lane("ahead_valid", NEIGHBOUR_AHEAD_POSITION, "Valid"),
+    Lane("ahead_emergency_brake", NEIGHBOUR_AHEAD_POSITION, "EmergencyBrake"),
+    Lane("ahead_rebased", NEIGHBOUR_AHEAD_POSITION, "Rebased"),
+    Lane("behind_valid", NEIGHBOUR_BEHIND_POSITION, "Valid"),
+    Lane("behind_emergency_brake", NEIGHBOUR_BEHIND_POSITION, "EmergencyBrake"),
+    Lane("behind_rebased", NEIGHBOUR_BEHIND_POSITION, "Rebased"),
+)
+OVERVIEW_LANES = ("mode", "supervision", "guard", "faults", "sensor")
+
+STATE_COLOURS: dict[str, Colour] = {
+    "normal": GREEN,
+    "good": GREEN,
+    "none": GREEN,
+    "running": GREEN,
+    "traction": BLUE,
+    "coast": GREY,
+    "brake": ORANGE,
+    "hold": VIOLET,
+    "warning": YELLOW,
+    "degraded": YELLOW,
+    "service_brake": ORANGE,
+    "emergency_brake": RED,
+    "emergency_request": RED,
+    "invalid": RED,
+}
+
+# Shown as bars by run, if the summary has them.
+BARS = (
+    "max_position_error_m",
+    "max_speed_error_m_s",
+    "rms_position_error_m",
+    "rms_speed_error_m_s",
+)
+
+# True errors: what is compared with the reference column of the same name.
+ERRORS = {"position_error_m": "position_m", "speed_error_m_s": "speed_m_s"}
+
+# Endings of names of quantities, longest first, and their units.
+_UNITS = (
+    ("_kwh_per_t", "kWh/t"),
+    ("_per_s", "1/s"),
+    ("_m_s3", "m/s³"),
+    ("_m_s2", "m/s²"),
+    ("_m_s", "m/s"),
+    ("_j", "J"),
+    ("_m", "m"),
+    ("_n", "N"),
+    ("_s", "s"),
+)
+
+
+class Reference(Protocol):
+    """What the train should do: float64 columns, one value a tick."""
+
+    @property
+    def position_m(self) -> np.ndarray: ...
+    @property
+    def speed_m_s(self) -> np.ndarray: ...
+    @property
+    def acceleration_m_s2(self) -> np.ndarray: ...
+
+
+class TraceWriter:
+    """Writes one trace. It must be closed: a file without its footer is refused by some tools."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        title: str,
+        period_s: float,
+        runs: int,
+        cars: int,
+        reference: Reference,
+        estimates: Sequence[str] = (),
+    ) -> None:
+        """Create the file and log the reference.
+
+        :param path: the .rrd file.
+        :param title: name of the recording: scenario, law, mode.
+        :param period_s: control period.
+        :param runs: how many runs are expected (for their names and colours; more may come).
+        :param cars: how many cars have a force of their own, 0 to 8.
+        :param estimates: names, with unit, of the law's estimates 0, 1, …
+        :raises ValueError: `cars` is out of range.
+        """
+        import rerun as rr  # costs a second and 100 MB: only who writes a trace pays for it
+
+        if not 0 <= cars <= MAX_CARS:
+            raise ValueError(f"{path}: cars = {cars}: expected 0 to {MAX_CARS}")
+        self._rr = rr
+        self._period_ns = round(period_s * 1e9)
+        self._runs = runs
+        self._reference = reference
+        self._estimates = tuple(estimates)
+        self._plots = (*PLOTS, _car_force_plot(cars)) if cars else PLOTS
+        self._state_names = {lane.name: _state_names(lane) for lane in LANES}
+        self._run: int | None = None
+        self._states: dict[str, int] = {}  # last value of each lane in this run
+        self._styled: set[str] = set()  # entities whose static style is logged
+        self._summary: list[dict[str, Any]] = []
+
+        identity = (str(path.resolve()), title, self._period_ns, runs, cars, self._estimates)
+        self._stream = rr.RecordingStream(
+            "ato-hil",
+            recording_id=hashlib.blake2b(repr(identity).encode(), digest_size=16).hexdigest(),
+        )
+        self._stream.set_log_time_enabled(False)
+        self._stream.set_log_tick_enabled(False)
+        sinks = [rr.FileSink(path)]  # a live viewer is one more
+        self._stream.set_sinks(*sinks)
+        self._stream.send_recording_name(title)
+        for field in ("position_m", "speed_m_s", "acceleration_m_s2"):
+            values = getattr(reference, field)[:, None]
+            index = self._index(np.arange(len(values)))
+            self._log_scalars(f"reference/{field}", index, values, ["reference"], [ORANGE])
+
+    def frames(self, run: int, frames: np.ndarray) -> None:
+        """Log FRAME rows of whole ticks; the batches of a run follow one another."""
+        if run != self._run:
+            self._run = run
+            self._states.clear()
+            layout = _blueprint(self._run_name(run), self._estimates)
+            self._stream.send_blueprint(layout)
+        found = {message.name: columns(frames, message) for message in MESSAGES}
+        for plot in self._plots:
+            ticks, values = _table(plot, found)
+            names = [line.label for line in plot.lines]
+            colours = [line.colour for line in plot.lines]
+            entity = self._entity(f"bus/{plot.name}", run)
+            self._log_scalars(entity, self._index(ticks, run), values, names, colours)
+        for number, name in enumerate(self._estimates):
+            ticks, value = estimate(frames, number)
+            entity = self._entity(f"bus/estimate_{number}", run)
+            index = self._index(ticks, run)
+            self._log_scalars(entity, index, value[:, None], [name], [self._colour(run)])
+        for lane in LANES:
+            self._log_lane(run, lane, *found[lane.message.name])
+        self._log_frames(run, frames)
+
+    def truth(self, run: int, table: np.ndarray) -> None:
+        """Log the true state of the plant: a structured array of float64 fields, a row a tick.
+
+        The names of the fields end in their units. The errors of `position_m` and `speed_m_s`
+        against the reference are logged beside them.
+        """
+        index = self._index(np.arange(len(table)), run)
+        for field in table.dtype.names or ():
+            entity = self._entity(f"truth/{field}", run)
+            self._log_scalars(entity, index, table[field][:, None], ["true"], [GREEN])
+        for error, field in ERRORS.items():
+            reference = getattr(self._reference, field)
+            count = min(len(table), len(reference))
+            values = (table[field][:count] - reference[:count])[:, None]
+            entity = self._entity(f"truth/{error}", run)
+            index = self._index(np.arange(count), run)
+            self._log_scalars(entity, index, values, [f"run {run}"], [self._colour(run)])
+
+    def run_summary(self, run: int, row: dict[str, Any]) -> None:
+        """Log a run's row of summary.json: its numbers on timeline `run`, bars, and a table."""
+        rr = self._rr
+        numbers = {key: value for key, value in row.items() if isinstance(value, int | float)}
+        numbers.pop("run", None)
+        self._summary.append({"run": run, **numbers})
+        index = [rr.TimeColumn("run", sequence=[run])]
+        for key, value in numbers.items():
+            self._log_scalars(f"runs/{key}", index, np.array([[value]]), [title_of(key)], [BLUE])
+        for key in BARS:
+            rows = [each for each in self._summary if key in each]
+            if rows:
+                bars = rr.BarChart(
+                    [each[key] for each in rows],
+                    abscissa=[each["run"] for each in rows],
+                    color=BLUE,
+                )
+                self._stream.log(f"runs/bars/{key}", bars, static=True, strict=True)
+        document = rr.TextDocument(_markdown(self._summary), media_type="text/markdown")
+        self._stream.log("runs/table", document, static=True, strict=True)
+
+    def text(self, run: int, tick: int, message: str, level: str = "INFO") -> None:
+        """Log an event; `level` is one of Rerun's: INFO, WARN, ERROR, CRITICAL."""
+        columns = self._rr.TextLog.columns(text=[message], level=[level])
+        self._send("events", self._index(np.array([tick]), run), columns)
+
+    def close(self) -> None:
+        """Write everything out, with the footer that makes the file complete."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _entity(self, name: str, run: int) -> str:
+        return f"{name}/{self._run_name(run)}"
+
+    def _run_name(self, run: int) -> str:
+        return f"run_{run:0{max(2, len(str(self._runs)))}}"
+
+    def _colour(self, run: int) -> Colour:
+        return _ramp((run - 1) / max(self._runs - 1, 1))
+
+    def _index(self, ticks: np.ndarray, run: int | None = None) -> list[rr.TimeColumn]:
+        """Columns of the timelines for rows at these ticks."""
+        time_ns = (ticks.astype(np.int64) * self._period_ns).astype("timedelta64[ns]")
+        index = [
+            self._rr.TimeColumn("tick", sequence=ticks),
+            self._rr.TimeColumn("time", duration=time_ns),
+        ]
+        if run is not None:
+            index.append(self._rr.TimeColumn("run", sequence=np.full(len(ticks), run)))
+        return index
+
+    def _log_scalars(
+        self,
+        entity: str,
+        index: list[rr.TimeColumn],
+        values: np.ndarray,
+        names: list[str],
+        colours: list[Colour],
+    ) -> None:
+        """Log a table of values (rows, lines); the first time, also how to draw its lines."""
+        if len(values) == 0:
+            return
+        if entity not in self._styled:
+            self._styled.add(entity)
+            style = self._rr.SeriesLines(names=names, colors=colours)
+            self._stream.log(entity, style, static=True, strict=True)
+        self._send(entity, index, self._rr.Scalars.columns(scalars=values))
+
+    def _log_lane(self, run: int, lane: Lane, ticks: np.ndarray, words: np.ndarray) -> None:
+        """Log where a state changes."""
+        if len(ticks) == 0:
+            return
+        values = decode_column(words, getattr(lane.message, lane.signal))
+        # No state is negative: the first one of a run is a change.
+        changes = np.flatnonzero(np.diff(values, prepend=self._states.get(lane.name, -1)))
+        self._states[lane.name] = int(values[-1])
+        if len(changes) == 0:
+            return
+        entity = self._entity("bus/state", run) + f"/{lane.name}"
+        names = self._state_names[lane.name]
+        if entity not in self._styled:
+            self._styled.add(entity)
+            colours = [STATE_COLOURS.get(name, GREY) for name in names.values()]
+            style = self._rr.StateConfiguration(values=[*names.values()], colors=colours)
+            self._stream.log(entity, style, static=True, strict=True)
+        states = [names.get(value) or _fault_text(value) for value in values[changes].tolist()]
+        index = self._index(ticks[changes], run)
+        self._send(entity, index, self._rr.StateChange.columns(state=states))
+
+    def _log_frames(self, run: int, frames: np.ndarray) -> None:
+        """Log the frames as they were, a row a tick."""
+        ticks, counts = np.unique(frames["tick"], return_counts=True)
+        columns = self._rr.DynamicArchetype.columns(
+            "ato_hil.Frames",
+            components={"frame_id": frames["frame_id"], "payload": frames["payload"]},
+        ).partition(counts)
+        self._send(self._entity("bus/frames", run), self._index(ticks, run), columns)
+
+    def _send(self, entity: str, index: list[rr.TimeColumn], columns: Any) -> None:
+        self._stream.send_columns(entity, index, columns, strict=True)
+
+
+def _car_force_plot(cars: int) -> Plot:
+    lines = [
+        Line(CAR_FORCES[car // 2], f"Car{car + 1}", f"car {car + 1}", CAR_COLOURS[car])
+        for car in range(cars)
+    ]
+    return Plot("car_force", "N", tuple(lines))
+
+
+def _table(
+    plot: Plot, found: dict[str, tuple[np.ndarray, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ticks, and physical values (ticks, lines): NaN where a tick lacks the message.
+
+    Of several frames of one message in a tick, the last counts.
+    """
+    ticks = found[plot.lines[0].message.name][0]
+    for line in plot.lines[1:]:
+        others = found[line.message.name][0]
+        if others is not ticks and not np.array_equal(others, ticks):
+            ticks = np.union1d(ticks, others)
+    values = np.full((len(ticks), len(plot.lines)), np.nan)
+    for column, line in enumerate(plot.lines):
+        at, words = found[line.message.name]
+        values[np.searchsorted(ticks, at), column] = physical(words, line.message, line.signal)
+    return ticks, values
+
+
+def _state_names(lane: Lane) -> dict[int, str]:
+    """Names of the values of a state, from the DBC where it has them."""
+    signal = database().get_message_by_name(lane.message.name).get_signal_by_name(lane.signal)
+    if signal.choices:
+        return {int(value): str(name) for value, name in signal.choices.items()}
+    return {0: "no", 1: "yes"} if signal.length == 1 else {0: "none"}
+
+
+def _fault_text(bits: int) -> str:
+    return ", ".join(fault_names(bits)) or f"{bits:#x}"
+
+
+def _ramp(fraction: float) -> Colour:
+    """Colour of a run, 0 for the first and 1 for the last."""
+    place = min(max(fraction, 0.0), 1.0) * (len(RUN_RAMP) - 1)
+    below = min(int(place), len(RUN_RAMP) - 2)
+    first, second = RUN_RAMP[below], RUN_RAMP[below + 1]
+    red, green, blue = (
+        round(a + (b - a) * (place - below)) for a, b in zip(first, second, strict=True)
+    )
+    return red, green, blue
+
+
+def title_of(name: str) -> str:
+    """Name of a quantity as a person reads it: `max_speed_error_m_s` is max speed error [m/s]."""
+    for ending, unit in _UNITS:
+        if name.endswith(ending):
+            return f"{name.removesuffix(ending).replace('_', ' ')} [{unit}]"
+    return name.replace("_", " ")
+
+
+def _markdown(rows: list[dict[str, Any]]) -> str:
+    """A table with a column a key and a line a run."""
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    lines = [
+        "| " + " | ".join(title_of(key) for key in keys) + " |",
+        "|" + " --- |" * len(keys),
+    ]
+    for row in rows:
+        cells = (f"{row[key]:.6g}" if key in row else "" for key in keys)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _blueprint(current: str, estimates: Sequence[str]) -> rrb.Blueprint:
+    """The views: `current` is the run in those that show one run."""
+    import rerun.blueprint as rrb
+
+    def plot(name: str, *contents: str, legend: bool = True) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(
+            name=name,
+            contents=[f"/{entity}" for entity in contents],
+            plot_legend=rrb.PlotLegend(visible=legend),
+        )
+
+    overview = rrb.Horizontal(
+        rrb.Vertical(
+            plot(
+                "Speed [m/s]",
+                f"bus/speed/{current}",
+                "reference/speed_m_s",
+                f"truth/speed_m_s/{current}",
+            ),
+            plot("Force by car [N]", f"bus/car_force/{current}"),
+            rrb.StateTimelineView(
+                name="States and faults",
+                contents=[f"/bus/state/{current}/{lane}" for lane in OVERVIEW_LANES],
+            ),
+            row_shares=[3, 2, 2],
+        ),
+        rrb.Vertical(
+            plot("True position error by run [m]", "truth/position_error_m/**"),
+            plot("True speed error by run [m/s]", "truth/speed_error_m_s/**"),
+            rrb.Horizontal(
+                *(
+                    plot(f"Estimate: {name}", f"bus/estimate_{number}/**", legend=False)
+                    for number, name in enumerate(estimates)
+                )
+            ),
+            rrb.Horizontal(
+                *(
+                    rrb.BarChartView(name=f"{title_of(key)} by run", origin=f"/runs/bars/{key}")
+                    for key in BARS
+                )
+            ),
+        ),
+        name="Overview",
+    )
+    return rrb.Blueprint(
+        overview,
+        rrb.TimePanel(state="collapsed", timeline="time"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+        auto_layout=False,
+    )
