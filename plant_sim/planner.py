@@ -1,10 +1,11 @@
-"""Planner: turns ramps, cruises and closing conditions into the segment table of the onboard reference.
+"""Planner: turns ramps, cruises and closing conditions into the onboard reference's segment table.
 
-A ramp is a jerk pulse, a stretch of constant acceleration and the opposite pulse; its speed change divided by its peak
-acceleration is the time between the pulses. These times seldom are whole control periods. Each pulse is therefore laid
-onto whole ticks so that its area (the peak acceleration) and the difference of the two first moments (the speed change)
-are exact integers and the ramp stays centred: the acceleration returns to exactly 0, the train stands at the end to the
-last bit, and lengths are those of continuous time.
+A ramp is a jerk pulse, a stretch of constant acceleration and the opposite pulse. Its speed change
+divided by its peak acceleration is the time between the pulses, seldom a whole number of control
+periods. Each pulse is therefore laid onto whole ticks so that its area (the peak acceleration) and
+the distance of the two (the speed change) are exact integers and the ramp stays centred: the
+acceleration returns to exactly 0, the train stands at the end to the last bit, and lengths are
+those of continuous time. Only + - * / and square root are used, so tables are the same everywhere.
 """
 
 import itertools
@@ -23,7 +24,8 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
 Change = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 
 DISTANCE_TOLERANCE_M = 1e-3
-SPEED_TOLERANCE_M_S = 1e-6  # rounding of speed levels, far below what a limit can mean
+SPEED_TOLERANCE_M_S = 1e-6  # rounding of levels, far below what a limit can mean
+LEVEL_TOLERANCE = 1e-6  # the same, relative
 SINUSOID_POSITION_M = 1e-3  # largest deviation of a sinusoidal ramp's table from the sine
 SINUSOID_SPEED_M_S = 1e-4
 
@@ -42,9 +44,10 @@ class SpeedLimit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 class Ramp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A change of speed; the train then cruises (or stands) until the next one.
 
-    Target: one of `to_m_s` (a number, or "solved": the speed that meets the distance), `to_km_h`, `by_m_s`.
-    Time: at most one of `start_s`, `end_s` and `after_s` (the end of the ramp before; 0 if none is given).
-    Shape: `acceleration_m_s2` and `jerk_m_s3`; or `sinusoidal_s`, the duration of a raised-cosine acceleration.
+    Target: one of `to_m_s`, `to_km_h` and `by_m_s`; `to_m_s = "solved"` is the speed that meets the
+    plan's distance. Time: one of `start_s`, `end_s` and `after_s`, the cruise since the ramp before
+    (0 if none is given). Shape: the levels `acceleration_m_s2` and `jerk_m_s3`, or `sinusoidal_s`,
+    the duration of a ramp whose acceleration is a raised cosine.
     """
 
     to_m_s: NotNegative | Literal["solved"] | None = None
@@ -71,7 +74,7 @@ class ProfilePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """A run from standstill to standstill, and what it has to keep."""
 
     duration_s: Positive
-    distance_m: Positive  # met within 1 mm
+    distance_m: Positive | None = None  # met within 1 mm; none: what the ramps give
     max_speed_m_s: Positive
     max_acceleration_m_s2: Positive
     max_jerk_m_s3: Positive
@@ -91,45 +94,45 @@ class Units:
 
 
 @dataclass(frozen=True)
+class Pulse:
+    """A jerk pulse on whole ticks."""
+
+    first: int  # tick
+    rows: NDArray[np.int64]  # jerk by tick
+
+
+@dataclass(frozen=True)
 class PlacedRamp:
-    """A ramp with its times in control periods, fractions included."""
+    """A ramp in table units, with its times in control periods, fractions included."""
 
     number: int  # 1 is the first of the plan
-    sinusoidal: bool
     change: int  # of speed, in Units.change_m_s
     start: float
-    rise: float  # of the acceleration, as long as its fall; half the duration if sinusoidal
-    duration: float
-
-    @property
-    def end(self) -> float:
-        return self.start + self.duration
-
-    @property
-    def centre(self) -> float:
-        return self.start + self.duration / 2
+    end: float
+    centre: float  # where a step of speed would give the same length
+    pulses: tuple[Pulse, ...]  # none: sinusoidal
 
 
 def plan_profile(plan: ProfilePlan, period_s: float) -> np.ndarray:
     """The `SEGMENT` table of a plan, shape (segments,), at a control period.
 
-    A ramp's peak acceleration and jerk exceed its levels by less than two units of the table (1.1e-7 m/s^2 and
-    1.1e-5 m/s^3 at 10 ms). Where no cruise lies between two ramps, one may end and the next begin inside one tick.
-    Raises PlanError if the plan cannot be met, ValueError for a period that the table cannot have.
+    A ramp's acceleration and jerk exceed its levels by less than two units of the table (1.1e-7
+    m/s^2 and 1.1e-5 m/s^3 at 10 ms). Without a cruise between them, one ramp may end and the next
+    begin inside one tick. Raises PlanError if the plan cannot be met, ValueError for a period that
+    the table cannot have.
     """
     units = _units(period_s)
     ticks = _whole_ticks(plan.duration_s, "duration_s", units)
     ramps = _place(plan, units, _solve_speed(plan, units))
     _check_ramps(plan, ramps, units)
 
-    rows = np.zeros(ticks + 1, np.int64)  # jerk by tick, and one that no ramp may need
+    rows = np.zeros(ticks + 2, np.int64)  # jerk by tick; the last two must stay 0
     for ramp in ramps:
-        if ramp.sinusoidal:
-            first = round(ramp.start)
-            rows[first : first + round(ramp.duration)] += _sinusoid(ramp, units)
+        if ramp.pulses:
+            _add(rows, ramp.pulses)
         else:
-            _add_ramp(rows, ramp)
-    if rows[ticks] != 0:
+            rows[round(ramp.start) : round(ramp.end)] += _sinusoid(ramp, units)
+    if rows[ticks:].any():
         raise PlanError(f"ramp {len(ramps)} ends after duration_s = {plan.duration_s:g}")
 
     segments = _segments(rows[:ticks])
@@ -137,16 +140,21 @@ def plan_profile(plan: ProfilePlan, period_s: float) -> np.ndarray:
     return segments
 
 
-def limit_at(limits: tuple[SpeedLimit, ...], ticks: NDArray[np.int64], period_s: float) -> Any:
-    """The limit in m/s at each of `ticks`; shape of `ticks`. Raises PlanError if it does not cover them in order."""
+def limit_at(
+    limits: tuple[SpeedLimit, ...], ticks: NDArray[np.int64], period_s: float
+) -> NDArray[np.float64]:
+    """The limit at each of `ticks`, m/s, of the same shape.
+
+    Raises PlanError if the limits are not in order or end before the last of `ticks`.
+    """
     units = _units(period_s)
     until = [_whole_ticks(limit.until_s, "until_s of a limit", units) for limit in limits]
     if any(later <= earlier for earlier, later in itertools.pairwise(until)):
         raise PlanError("the until_s of the limits do not increase")
     if not until or until[-1] < ticks.max():
         raise PlanError(f"the limits end before {ticks.max() * period_s:g} s")
-    speeds = np.array([limit.speed_m_s for limit in limits])
-    return speeds[np.searchsorted(until, ticks)]
+    speeds_m_s = np.array([limit.speed_m_s for limit in limits])
+    return speeds_m_s[np.searchsorted(until, ticks)]
 
 
 # Placing the ramps in time.
@@ -156,6 +164,8 @@ def _solve_speed(plan: ProfilePlan, units: Units) -> float:
     """The speed of the "solved" ramps, m/s; 0 without any."""
     if not any(ramp.to_m_s == "solved" for ramp in plan.ramps):
         return 0.0
+    if plan.distance_m is None:
+        raise PlanError('a plan with to_m_s = "solved" needs distance_m')
 
     low, high = 0.0, plan.max_speed_m_s
     shortest, longest = _distance_m(plan, units, low), _distance_m(plan, units, high)
@@ -184,47 +194,51 @@ def _place(plan: ProfilePlan, units: Units, solved_m_s: float) -> list[PlacedRam
     placed: list[PlacedRamp] = []
     speed_m_s, level, end = 0.0, 0, 0.0
     for number, ramp in enumerate(plan.ramps, 1):
-        speed_m_s = _target_m_s(ramp, speed_m_s, solved_m_s)
+        before_m_s, speed_m_s = speed_m_s, _target_m_s(ramp, speed_m_s, solved_m_s)
         change = round(speed_m_s / units.change_m_s) - level
         level += change
-        rise, duration = _durations(ramp, number, abs(change), units)
+        rise, duration = _durations(ramp, number, abs(speed_m_s - before_m_s), units)
         if ramp.start_s is not None:
-            start: float = _ramp_ticks(ramp.start_s, number, "start_s", units)
+            start = float(_ramp_ticks(ramp.start_s, number, "start_s", units))
         elif ramp.end_s is not None:
             start = _ramp_ticks(ramp.end_s, number, "end_s", units) - duration
         else:
             start = end + _ramp_ticks(ramp.after_s or 0.0, number, "after_s", units)
-        sinusoidal = ramp.sinusoidal_s is not None
-        start = math.ceil(start) if sinusoidal else _snap(start)
-        placed.append(PlacedRamp(number, sinusoidal, change, start, rise, duration))
-        end = placed[-1].end
+        start = _snap(start)
+        if ramp.sinusoidal_s is not None:
+            start = float(math.ceil(start))
+        end = start + duration
+        centre, pulses = (start + end) / 2, tuple[Pulse, ...]()
+        if ramp.sinusoidal_s is None and change != 0:
+            pulses = _place_pulses(change, start, rise, duration)
+            centre = _centre(pulses, change)
+        placed.append(PlacedRamp(number, change, start, end, centre, pulses))
     return placed
 
 
 def _target_m_s(ramp: Ramp, speed_m_s: float, solved_m_s: float) -> float:
-    if ramp.by_m_s is not None:
-        return speed_m_s + ramp.by_m_s
-    if ramp.to_km_h is not None:
-        return ramp.to_km_h / 3.6
     if ramp.to_m_s == "solved":
         return solved_m_s
-    assert ramp.to_m_s is not None
-    return ramp.to_m_s
+    if ramp.to_m_s is not None:
+        return ramp.to_m_s
+    if ramp.to_km_h is not None:
+        return ramp.to_km_h / 3.6
+    return speed_m_s + (ramp.by_m_s or 0.0)
 
 
-def _durations(ramp: Ramp, number: int, size: int, units: Units) -> tuple[float, float]:
-    """Ticks in which the acceleration rises, and ticks of the whole ramp, for a speed change of `size`."""
+def _durations(ramp: Ramp, number: int, change_m_s: float, units: Units) -> tuple[float, float]:
+    """Rise of the acceleration and duration of the ramp, in ticks, for a speed change."""
     if ramp.sinusoidal_s is not None:
         ticks = _ramp_ticks(ramp.sinusoidal_s, number, "sinusoidal_s", units)
         return ticks / 2, ticks
-    if size == 0:
+    if change_m_s == 0:
         return 0.0, 0.0
-    assert ramp.acceleration_m_s2 is not None and ramp.jerk_m_s3 is not None
-    jerk = ramp.jerk_m_s3 / units.jerk_m_s3
+    assert ramp.acceleration_m_s2 is not None
+    assert ramp.jerk_m_s3 is not None
     # A small change turns from the one pulse to the other before the acceleration is reached.
-    peak = min(ramp.acceleration_m_s2 / units.acceleration_m_s2, math.sqrt(size * jerk))
-    rise = _snap(peak / jerk)
-    return rise, rise + _snap(size / peak)
+    peak_m_s2 = min(ramp.acceleration_m_s2, math.sqrt(change_m_s * ramp.jerk_m_s3))
+    rise = _snap(peak_m_s2 / ramp.jerk_m_s3 / units.period_s)
+    return rise, rise + _snap(change_m_s / peak_m_s2 / units.period_s)
 
 
 def _snap(ticks: float) -> float:
@@ -246,33 +260,35 @@ def _whole_ticks(time_s: float, name: str, units: Units) -> int:
 # Laying a ramp onto whole ticks.
 
 
-def _add_ramp(rows: NDArray[np.int64], ramp: PlacedRamp) -> None:
+def _place_pulses(change: int, start: float, rise: float, duration: float) -> tuple[Pulse, Pulse]:
     # Rounded up, so that the pulses never need more room than on paper.
-    peak = math.ceil(abs(ramp.change) / (ramp.duration - ramp.rise))
-    slope = min(math.ceil(peak / ramp.rise), peak)
-    _add_pulses(rows, ramp.change, peak, slope, ramp.start, ramp.centre)
+    peak = math.ceil(abs(change) / (duration - rise))
+    slope = min(math.ceil(peak / rise), peak)
+    earliest = peak * math.floor(start) + _box_moment(peak, slope)
+    return _lay_pulses(change, peak, slope, start + duration / 2, earliest)
 
 
-def _add_pulses(
-    rows: NDArray[np.int64], change: int, peak: int, slope: int, start: float, centre: float
-) -> None:
-    """Add a pulse of area `peak` and its opposite, which together change the speed by exactly `change`.
+def _lay_pulses(
+    change: int, peak: int, slope: int, centre: float, earliest: int
+) -> tuple[Pulse, Pulse]:
+    """A box of area `peak` and height `slope`, and its opposite, around `centre`.
 
-    That change is the difference of their first moments, each the sum of tick times jerk.
+    The difference of their moments, each the sum of tick times jerk, is the change of speed: exact.
     """
     direction, size = (1, change) if change > 0 else (-1, -change)
-    earliest = peak * math.floor(start) + _box_moment(peak, slope)
-    rising = max(round(peak * (centre - 0.5) - size / 2), earliest)
-    for sign, moment in ((direction, rising), (-direction, rising + size)):
-        first, pulse = _pulse(peak, slope, moment)
-        rows[first : first + len(pulse)] += sign * pulse
+    moment = max(round(peak * (centre - 0.5) - size / 2), earliest)
+    begin, rising, lack = _lay_box(peak, slope, moment)
+    turn, falling, lack = _lay_box(peak, slope, moment - lack + size)
+    falling[-1 - lack] -= 1
+    falling[-1] += 1
+    return Pulse(begin, direction * rising), Pulse(turn, -direction * falling)
 
 
-def _pulse(area: int, slope: int, moment: int) -> tuple[int, NDArray[np.int64]]:
-    """First tick and rows of a box of height `slope` with this area and first moment; slope <= area.
+def _lay_box(area: int, slope: int, moment: int) -> tuple[int, NDArray[np.int64], int]:
+    """Lay a box of height `slope` (at most `area`) onto ticks: its first tick, its rows, its lack.
 
-    The box begins and ends inside a tick: its first and last rows are parts of `slope`. What then lacks of the moment
-    is less than a row; one unit of jerk moved that far to the last row supplies it.
+    The box begins and ends inside a tick, so its first and last rows are parts of `slope`. Its
+    moment lacks less than the number of its rows, which one unit moved by that many rows supplies.
     """
     full, rest = divmod(area, slope)
     first, excess = divmod(moment - _box_moment(area, slope), area)
@@ -283,13 +299,10 @@ def _pulse(area: int, slope: int, moment: int) -> tuple[int, NDArray[np.int64]]:
     else:
         inner = full
         last, lack = divmod(excess - full * (slope - rest), full + 1)
-    pulse = np.full(inner + 2, slope, np.int64)
-    pulse[0] = area - inner * slope - last
-    pulse[-1] = last
-    if lack:
-        pulse[-1 - lack] -= 1
-        pulse[-1] += 1
-    return first, pulse if pulse[-1] else pulse[:-1]
+    box = np.full(inner + 2, slope, np.int64)
+    box[0] = area - inner * slope - last
+    box[-1] = last
+    return first, box, lack
 
 
 def _box_moment(area: int, slope: int) -> int:
@@ -298,9 +311,24 @@ def _box_moment(area: int, slope: int) -> int:
     return slope * full * (full - 1) // 2 + rest * full
 
 
+def _centre(pulses: tuple[Pulse, ...], change: int) -> float:
+    """Tick at which a step of speed would give the length that the pulses give."""
+    second_moment = sum(
+        jerk * tick * tick
+        for pulse in pulses
+        for tick, jerk in enumerate(pulse.rows.tolist(), pulse.first)
+    )
+    return 0.5 - second_moment / (2 * change)
+
+
+def _add(rows: NDArray[np.int64], pulses: tuple[Pulse, ...]) -> None:
+    for pulse in pulses:
+        rows[pulse.first : pulse.first + len(pulse.rows)] += pulse.rows
+
+
 def _sinusoid(ramp: PlacedRamp, units: Units) -> NDArray[np.int64]:
     """Rows of a sinusoidal ramp, in the fewest segments that stay close to the sine."""
-    size, ticks = abs(ramp.change), round(ramp.duration)
+    size, ticks = abs(ramp.change), round(ramp.end - ramp.start)
     x, v, _ = _raised_cosine(size, ticks, np.arange(ticks + 1) / ticks)
     # Without rounding, n segments in each half deviate by 0.04 dv / n^3.
     change_m_s = size * units.change_m_s
@@ -312,11 +340,13 @@ def _sinusoid(ramp: PlacedRamp, units: Units) -> NDArray[np.int64]:
         speed_m_s = np.abs(table.v - v).max() * units.change_m_s / 2
         if position_m < SINUSOID_POSITION_M and speed_m_s < SINUSOID_SPEED_M_S:
             return rows if ramp.change > 0 else -rows
-    raise PlanError(f"ramp {ramp.number}: no small table follows a sinusoid of this duration")
+    raise PlanError(
+        f"ramp {ramp.number}: no table of {units.period_s:g} s periods follows this sinusoid"
+    )
 
 
 def _sinusoid_rows(size: int, ticks: int, count: int) -> NDArray[np.int64]:
-    """Rows with `count` segments up to the peak of the acceleration and their mirror image after it.
+    """Rows with `count` segments up to the acceleration's peak and their mirror image after it.
 
     Straight lines between knots lie beside a curve by a twelfth of step^2 a'' on average, so the
     knots lie as much on its other side. The first knot has to be 0; its step, shorter by sqrt(2),
@@ -330,9 +360,8 @@ def _sinusoid_rows(size: int, ticks: int, count: int) -> NDArray[np.int64]:
     for begin, end in itertools.pairwise(knots):
         n = end - begin
         _, goal_v, goal_a = _raised_cosine(size, ticks, end / ticks)
-        mean_a = size / ticks
-        bend = (mean_a - goal_a) * (2 * math.pi / ticks) ** 2  # a''
-        goal_a -= bend * step**2 / 12
+        turn = 2 * math.pi / ticks * step
+        goal_a -= (size / ticks - goal_a) * turn * turn / 12
         # What this knot lacks in speed, its acceleration shall have brought in by the next.
         jerk = max(0, round((goal_v + 2 * n * goal_a - v - 4 * n * a) / (3 * n * n)))
         rows[begin:end] = jerk
@@ -343,24 +372,25 @@ def _sinusoid_rows(size: int, ticks: int, count: int) -> NDArray[np.int64]:
     missing = size - int(np.cumsum(rows).sum())
     if missing:
         peak = math.ceil(abs(missing) / half)
-        _add_pulses(rows, missing, peak, peak, 0, ticks / 2)
+        _add(rows, _lay_pulses(missing, peak, peak, ticks / 2, 0))
     return rows
 
 
 def _raised_cosine(size: int, ticks: int, z: Any) -> tuple[Any, Any, Any]:
-    """Position, speed and acceleration (table units) of a sinusoidal ramp from rest at the part z of its time D:
+    """Position, speed and acceleration of a sinusoidal ramp at the part z of its time D.
 
-    a = dv/D (1 - cos(2 pi z)), v = dv (z - sin(2 pi z) / (2 pi)).
+    a = dv/D (1 - cos(2 pi z)), v = dv (z - sin(2 pi z) / (2 pi)), from rest, in table units.
     """
-    wave = _sine(math.pi * z) ** 2
-    x = 3 * size * ticks * (z * z - wave / math.pi**2)
+    half_wave = _sine(math.pi * z)
+    wave = half_wave * half_wave
+    x = 3 * size * ticks * (z * z - wave / (math.pi * math.pi))
     v = 2 * size * (z - _sine(2 * math.pi * z) / (2 * math.pi))
     a = 2 * size / ticks * wave
     return x, v, a
 
 
 def _sine(angle: Any) -> Any:
-    """Sine of 0 to 2 pi by its series: the C library's differs between machines, and tables must not."""
+    """Sine of 0 to 2 pi by its series: that of the C library differs between machines."""
     total = term = angle
     for k in range(1, 21):
         term = term * (-angle * angle) / (2 * k * (2 * k + 1))
@@ -401,7 +431,7 @@ def _check_ramps(plan: ProfilePlan, ramps: list[PlacedRamp], units: Units) -> No
         if speed_m_s < -SPEED_TOLERANCE_M_S:
             raise PlanError(f"{name} ends at {speed_m_s:.4f} m/s, below 0")
         acceleration, jerk = _levels(ramp, placed, units)
-        _check_limit(name, "max_speed_m_s", speed_m_s, plan.max_speed_m_s + SPEED_TOLERANCE_M_S)
+        _check_limit(name, "max_speed_m_s", speed_m_s, plan.max_speed_m_s)
         _check_limit(name, "max_acceleration_m_s2", acceleration, plan.max_acceleration_m_s2)
         _check_limit(name, "max_jerk_m_s3", jerk, plan.max_jerk_m_s3)
     if end_s > plan.duration_s + units.period_s * 1e-6:
@@ -414,20 +444,20 @@ def _levels(ramp: Ramp, placed: PlacedRamp, units: Units) -> tuple[float, float]
     """Peak acceleration and jerk of a ramp, m/s^2 and m/s^3."""
     if ramp.acceleration_m_s2 is not None and ramp.jerk_m_s3 is not None:
         return ramp.acceleration_m_s2, ramp.jerk_m_s3
-    duration_s = placed.duration * units.period_s
+    duration_s = (placed.end - placed.start) * units.period_s
     mean_m_s2 = abs(placed.change) * units.change_m_s / duration_s
     return 2 * mean_m_s2, 2 * math.pi * mean_m_s2 / duration_s
 
 
 def _check_limit(name: str, key: str, value: float, limit: float) -> None:
-    if value > limit:
+    if value > limit * (1 + LEVEL_TOLERANCE):
         raise PlanError(f"{name} needs {value:g}, above {key} = {limit:g}")
 
 
 def _check_profile(plan: ProfilePlan, profile: Profile, units: Units) -> None:
     """Length and limits over time of the finished table."""
     length_m = float(profile.position_m[-1])
-    if abs(length_m - plan.distance_m) > DISTANCE_TOLERANCE_M:
+    if plan.distance_m and abs(length_m - plan.distance_m) > DISTANCE_TOLERANCE_M:
         raise PlanError(f"the plan is {length_m:.4f} m long, distance_m = {plan.distance_m:.4f}")
     if plan.limits:
         ticks = np.arange(len(profile.speed_m_s))
@@ -436,8 +466,8 @@ def _check_profile(plan: ProfilePlan, profile: Profile, units: Units) -> None:
         if over.any():
             tick = int(np.argmax(over))
             raise PlanError(
-                f"{profile.speed_m_s[tick]:.4f} m/s at {tick * units.period_s:g} s is above the limit"
-                f" {limit[tick]:g} m/s less margin_m_s = {plan.margin_m_s:g}"
+                f"{profile.speed_m_s[tick]:.4f} m/s at {tick * units.period_s:g} s is above"
+                f" the limit of {limit[tick]:g} m/s less margin_m_s = {plan.margin_m_s:g}"
             )
 
 

@@ -1,19 +1,20 @@
 """The onboard reference: a table of constant-jerk segments, evaluated exactly in integers.
 
-A segment `(ticks, jerk)` holds one jerk for a whole number of control periods. With the control period T the units are
+A segment `(ticks, jerk)` holds one jerk for a whole number of control periods T, in the units
 
-    position       2^-40 m
-    speed      3 * 2^-40 / T     m/s     (2.7e-10 at T = 10 ms)
-    acceleration 6 * 2^-40 / T^2 m/s^2   (5.5e-8)
-    jerk       6 * 2^-40 / T^3   m/s^3   (5.5e-6)
+    position         2^-40 m            (9.1e-13 m)
+    speed        3 * 2^-40 / T m/s      (2.7e-10 m/s at 10 ms)
+    acceleration 6 * 2^-40 / T^2 m/s^2  (5.5e-8 m/s^2)
+    jerk         6 * 2^-40 / T^3 m/s^3  (5.5e-6 m/s^3)
 
-and one control period is, with the old values on the right,
+In these, one control period is, with the old values on the right,
 
     x += 3 v + 3 a + J;   v += 2 a + J;   a += J
 
-which loses nothing: firmware, plant and reports agree to the bit. The profile starts at rest at position 0.
+without any loss, so firmware, plant and reports agree to the bit. The profile starts at rest at 0.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,8 +45,8 @@ class Profile:
 def evaluate(segments: NDArray[np.void], period_s: float) -> Profile:
     """Evaluate a table of `SEGMENT` rows at every tick.
 
-    Raises ValueError if the period is not one of the exact ones (see `unit_factors`), if a segment has no ticks,
-    or if the profile leaves the firmware's range (+-65.5 km, +-128 m/s, +-16 m/s^2) or lasts longer than 9 h.
+    Raises ValueError for a period that `unit_factors` refuses, a segment without ticks, a profile
+    that lasts longer than 9 h or leaves the firmware's range (65.5 km, 128 m/s, 16 m/s^2).
     """
     speed_factor, acceleration_factor = unit_factors(period_s)
     ticks = segments["ticks"].astype(np.int64)
@@ -67,9 +68,9 @@ def evaluate(segments: NDArray[np.void], period_s: float) -> Profile:
         x=x,
         v=v,
         a=a,
-        position_m=x * POSITION_UNIT_M,
-        speed_m_s=v * speed_factor * POSITION_UNIT_M,
-        acceleration_m_s2=a * acceleration_factor * POSITION_UNIT_M,
+        position_m=_to_si(x, 1),
+        speed_m_s=_to_si(v, speed_factor),
+        acceleration_m_s2=_to_si(a, acceleration_factor),
         position_q15=position_q15,
         speed_q24=speed_q24,
         acceleration_q27=acceleration_q27,
@@ -77,18 +78,18 @@ def evaluate(segments: NDArray[np.void], period_s: float) -> Profile:
 
 
 def unit_factors(period_s: float) -> tuple[int, int]:
-    """The integers 3/T and 6/T^2 that turn speed and acceleration units into 2^-40 m/s and 2^-40 m/s^2.
+    """3/T and 6/T^2: speed and acceleration units in 2^-40 m/s and 2^-40 m/s^2.
 
     Raises ValueError if they are not integers: 10, 20, 50 and 100 ms are possible, 30 ms is not.
     """
     if not 0 < period_s <= 1:
         raise ValueError(f"control period {period_s} s is not above 0 and at most 1 s")
     speed_factor = round(3 / period_s)
-    acceleration_factor = round(6 / period_s**2)
-    exact = np.isclose(
-        [speed_factor * period_s, acceleration_factor * period_s**2], [3, 6], rtol=1e-12, atol=0
-    )
-    if not exact.all():
+    acceleration_factor = round(6 / (period_s * period_s))
+    if not (
+        math.isclose(speed_factor * period_s, 3, rel_tol=1e-12)
+        and math.isclose(acceleration_factor * period_s * period_s, 6, rel_tol=1e-12)
+    ):
         raise ValueError(f"control period {period_s} s does not make 3/T and 6/T^2 integers")
     return speed_factor, acceleration_factor
 
@@ -97,9 +98,11 @@ def _running_sum(steps: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate([np.zeros(1, np.int64), np.cumsum(steps)])
 
 
-def _to_int32(
-    values: NDArray[np.int64], factor: int, shift: int, name: str
-) -> NDArray[np.int32]:
+def _to_si(values: NDArray[np.int64], factor: int) -> NDArray[np.float64]:
+    return (values * factor).astype(np.float64) * POSITION_UNIT_M
+
+
+def _to_int32(values: NDArray[np.int64], factor: int, shift: int, name: str) -> NDArray[np.int32]:
     half = 1 << (shift - 1)  # round half up, as the firmware does
     lowest, highest = int(values.min()) * factor, int(values.max()) * factor
     if (lowest + half) >> shift < INT32.min or (highest + half) >> shift > INT32.max:

@@ -45,7 +45,7 @@ def build(loaded: Loaded, seed: int) -> World:
     """The plant of a scenario."""
     scenario = loaded.scenario
     train = scenario.train
-    model = MODELS["lumped"]
+    model = MODELS[type(train)]
     smeared = scenario.track.application == "smeared"
     params = np.zeros(1, plant.params_dtype(model.PARAMS))
     params["train"] = model.calibrate(train, scenario.period_s, smeared)
@@ -53,14 +53,14 @@ def build(loaded: Loaded, seed: int) -> World:
         scenario.actuator, train.mass_kg, scenario.period_s, scenario.period_s / train.substeps
     )
     node = params["node"]
-    cars = len(train.masses_kg)
+    cars = len(train.effectiveness)
     node["cars"] = cars if scenario.control.distribute else 0
     node["effectiveness"][0, :cars] = train.effectiveness
     node["position_step_m"] = scenario.sensors.position_step_m
     node["speed_step_m_s"] = scenario.sensors.speed_step_m_s
     node["speed_noise_m_s"] = scenario.sensors.speed_noise_m_s
     node["rear_weight"] = 0.5 if scenario.sensors.location == "mean" else 0.0
-    node["rear_offset_m"] = train.pitch_m * (cars - 1)
+    node["rear_offset_m"] = train.rear_offset_m
 
     limits = np.zeros(len(scenario.profile.limits), plant.LIMIT)
     for row, limit in zip(limits, scenario.profile.limits, strict=True):

@@ -191,12 +191,7 @@ def run(
         )
         bench.wait_ready()
         plant.command(command="start")
-        recorded = 0
-        while recorded < runs:
+        while "done" not in plant.said or recorder.said.get("run", {}).get("run") != runs:
             got = bench.next_event(0.5)
-            if got is None:
-                continue
-            node, event = got
-            if node is recorder and event["event"] == "run":
-                recorded += 1
-            yield node, event, bench
+            if got is not None:
+                yield (*got, bench)

@@ -107,30 +107,39 @@ def run(
     loop = build_loop(node.tick, here.sense, here.actuate_and_advance)
     frames = world.rows(np.zeros(loaded.ticks * MESSAGE_COUNT, FRAME))
     profile = world.rows(calibration.profile)
+    chance = world.rows(np.zeros(loaded.ticks, plant.CHANCE))
+    truth = world.rows(np.zeros(loaded.ticks, plant.TRUTH))
+
+    def drive(ticks: int, chance: Any, truth: Any) -> int:
+        return int(
+            loop(
+                ticks,
+                here.params,
+                here.limits,
+                here.track,
+                here.state,
+                chance,
+                truth,
+                node.params,
+                profile,
+                node.state,
+                node.cells,
+                node.rx,
+                node.tx,
+                frames,
+            )
+        )
+
+    drive(0, chance, truth)  # compiles, or loads what was compiled before
     for number in range(1, runs + 1):
         if progress:
             progress(number, 0)
         _announce(here, node, plant.ARMED, number)
         here.begin(here.params, here.state)
-        truth = np.zeros(loaded.ticks, plant.TRUTH)
         chance = world.rows(world.chance(loaded, seed, number))
+        truth = np.zeros(loaded.ticks, plant.TRUTH)
         started = time.perf_counter()
-        count = loop(
-            loaded.ticks,
-            here.params,
-            here.limits,
-            here.track,
-            here.state,
-            chance,
-            world.rows(truth),
-            node.params,
-            profile,
-            node.state,
-            node.cells,
-            node.rx,
-            node.tx,
-            frames,
-        )
+        count = drive(loaded.ticks, chance, world.rows(truth))
         seconds = time.perf_counter() - started
         faults = fault_names(int(node.state["core"]["faults"]))
         _announce(here, node, plant.ENDED, number)

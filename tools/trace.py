@@ -65,6 +65,8 @@ VIOLET: Colour = (150, 120, 220)
 
 # A run's colour, from the first run to the last: the eye sees learning as a change of colour.
 RUN_RAMP: tuple[Colour, ...] = (VIOLET, RED, ORANGE, YELLOW)
+THIN, WIDE = 1.5, 4.0  # lines; a wide one stays visible under a thin one
+
 CAR_COLOURS: tuple[Colour, ...] = (GREY, BLUE, GREEN, YELLOW, ORANGE, RED, PINK, VIOLET)
 
 
@@ -75,6 +77,7 @@ class Line(NamedTuple):
     signal: str
     label: str
     colour: Colour
+    width: float = THIN
 
 
 class Plot(NamedTuple):
@@ -90,14 +93,14 @@ PLOTS = (
         "speed",
         "m/s",
         (
-            Line(TRAIN_SPEED, "Speed", "measured", BLUE),
+            Line(TRAIN_SPEED, "Speed", "measured", BLUE, WIDE),
             Line(ATP_LIMIT, "TargetSpeed", "target", PINK),
             Line(ATP_LIMIT, "PermittedSpeed", "permitted", RED),
         ),
     ),
-    Plot("position", "m", (Line(TRAIN_POSITION, "Position", "measured", BLUE),)),
-    Plot("acceleration", "m/s²", (Line(TRAIN_SPEED, "Acceleration", "measured", BLUE),)),
-    Plot("force", "N", (Line(FORCE_CMD, "Force", "commanded", BLUE),)),
+    Plot("position", "m", (Line(TRAIN_POSITION, "Position", "measured", BLUE, WIDE),)),
+    Plot("acceleration", "m/s²", (Line(TRAIN_SPEED, "Acceleration", "measured", BLUE, WIDE),)),
+    Plot("force", "N", (Line(FORCE_CMD, "Force", "commanded", BLUE, WIDE),)),
     Plot("target_distance", "m", (Line(ATP_LIMIT, "TargetDistance", "to target", PINK),)),
     Plot("position_error", "m", (Line(ATO_TRACKING, "PositionError", "controller", BLUE),)),
     Plot("speed_error", "m/s", (Line(ATO_TRACKING, "SpeedError", "controller", BLUE),)),
@@ -285,18 +288,20 @@ class TraceWriter:
 
     def frames(self, run: int, frames: np.ndarray) -> None:
         """Log FRAME rows of whole ticks; the batches of a run follow one another."""
+        found = {message.name: columns(frames, message) for message in MESSAGES}
         if run != self._run:
             self._run = run
             self._states.clear()
-            layout = _blueprint(self._run_name(run), self._estimates)
+            neighbours = len(found[NEIGHBOUR_AHEAD_POSITION.name][0]) > 0
+            layout = _blueprint(self._run_name(run), self._estimates, neighbours)
             self._stream.send_blueprint(layout)
-        found = {message.name: columns(frames, message) for message in MESSAGES}
         for plot in self._plots:
             ticks, values = _table(plot, found)
             names = [line.label for line in plot.lines]
             colours = [line.colour for line in plot.lines]
+            widths = [line.width for line in plot.lines]
             entity = self._entity(f"bus/{plot.name}", run)
-            self._log_scalars(entity, self._index(ticks, run), values, names, colours)
+            self._log_scalars(entity, self._index(ticks, run), values, names, colours, widths)
         for number, name in enumerate(self._estimates):
             ticks, value = estimate(frames, number)
             entity = self._entity(f"bus/estimate_{number}", run)
@@ -382,13 +387,14 @@ class TraceWriter:
         values: np.ndarray,
         names: list[str],
         colours: list[Colour],
+        widths: Sequence[float] = (THIN,),
     ) -> None:
         """Log a table of values (rows, lines); the first time, also how to draw its lines."""
         if len(values) == 0:
             return
         if entity not in self._styled:
             self._styled.add(entity)
-            style = self._rr.SeriesLines(names=names, colors=colours)
+            style = self._rr.SeriesLines(names=names, colors=colours, widths=widths)
             self._stream.log(entity, style, static=True, strict=True)
         self._send(entity, index, self._rr.Scalars.columns(scalars=values))
 
@@ -415,11 +421,12 @@ class TraceWriter:
 
     def _log_frames(self, run: int, frames: np.ndarray) -> None:
         """Log the frames as they were, a row a tick."""
+        import pyarrow as pa  # type: ignore[import-untyped]
+
         ticks, counts = np.unique(frames["tick"], return_counts=True)
-        columns = self._rr.DynamicArchetype.columns(
-            "ato_hil.Frames",
-            components={"frame_id": frames["frame_id"], "payload": frames["payload"]},
-        ).partition(counts)
+        components = {name: pa.array(frames[name]) for name in ("frame_id", "payload")}
+        columns = self._rr.DynamicArchetype.columns("ato_hil.Frames", components=components)
+        columns = columns.partition(counts)
         self._send(self._entity("bus/frames", run), self._index(ticks, run), columns)
 
     def _send(self, entity: str, index: list[rr.TimeColumn], columns: Any) -> None:
@@ -477,11 +484,11 @@ def _ramp(fraction: float) -> Colour:
 
 
 def title_of(name: str) -> str:
-    """Name of a quantity as a person reads it: `max_speed_error_m_s` is max speed error [m/s]."""
+    """Name of a quantity as a person reads it: `max_speed_error_m_s` is Max speed error [m/s]."""
     for ending, unit in _UNITS:
         if name.endswith(ending):
-            return f"{name.removesuffix(ending).replace('_', ' ')} [{unit}]"
-    return name.replace("_", " ")
+            return f"{name.removesuffix(ending).replace('_', ' ').capitalize()} [{unit}]"
+    return name.replace("_", " ").capitalize()
 
 
 def _markdown(rows: list[dict[str, Any]]) -> str:
@@ -497,53 +504,110 @@ def _markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _blueprint(current: str, estimates: Sequence[str]) -> rrb.Blueprint:
-    """The views: `current` is the run in those that show one run."""
+def _blueprint(current: str, estimates: Sequence[str], neighbours: bool) -> rrb.Blueprint:
+    """The views; `current` is the run in those that show one run."""
+    import rerun as rr
     import rerun.blueprint as rrb
 
-    def plot(name: str, *contents: str, legend: bool = True) -> rrb.TimeSeriesView:
+    whole = rrb.TimeAxis(
+        view_range=rr.TimeRange(
+            start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
+        )
+    )
+
+    def plot(name: str, *entities: str, legend: bool = True) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
             name=name,
-            contents=[f"/{entity}" for entity in contents],
-            plot_legend=rrb.PlotLegend(visible=legend),
+            contents=[f"/{entity}" for entity in entities],
+            axis_x=whole,
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
+        )
+
+    def by_run(name: str, entity: str) -> rrb.TimeSeriesView:
+        return plot(name, f"{entity}/**", legend=False)  # the colours tell the runs apart
+
+    def bars(key: str) -> rrb.BarChartView:
+        return rrb.BarChartView(
+            name=f"{title_of(key)} by run",
+            origin=f"/runs/bars/{key}",
+            plot_legend=rrb.PlotLegend(visible=False),
         )
 
     overview = rrb.Horizontal(
         rrb.Vertical(
             plot(
-                "Speed [m/s]",
+                "Speed: measured blue, reference orange, permitted red, target pink [m/s]",
                 f"bus/speed/{current}",
                 "reference/speed_m_s",
-                f"truth/speed_m_s/{current}",
+                legend=False,
             ),
             plot("Force by car [N]", f"bus/car_force/{current}"),
             rrb.StateTimelineView(
                 name="States and faults",
-                contents=[f"/bus/state/{current}/{lane}" for lane in OVERVIEW_LANES],
+                origin=f"/bus/state/{current}",
+                time_view=whole,
+                contents=[f"$origin/{lane}" for lane in OVERVIEW_LANES],
             ),
-            row_shares=[3, 2, 2],
+            row_shares=[7, 5, 6],
         ),
         rrb.Vertical(
-            plot("True position error by run [m]", "truth/position_error_m/**"),
-            plot("True speed error by run [m/s]", "truth/speed_error_m_s/**"),
-            rrb.Horizontal(
-                *(
-                    plot(f"Estimate: {name}", f"bus/estimate_{number}/**", legend=False)
-                    for number, name in enumerate(estimates)
-                )
+            by_run("Position error, first run violet, last yellow [m]", "truth/position_error_m"),
+            by_run("Speed error, first run violet, last yellow [m/s]", "truth/speed_error_m_s"),
+            *(
+                [
+                    rrb.Horizontal(
+                        *(
+                            by_run(f"Estimate {name}", f"bus/estimate_{number}")
+                            for number, name in enumerate(estimates)
+                        )
+                    )
+                ]
+                if estimates
+                else []
             ),
-            rrb.Horizontal(
-                *(
-                    rrb.BarChartView(name=f"{title_of(key)} by run", origin=f"/runs/bars/{key}")
-                    for key in BARS
-                )
-            ),
+            rrb.Horizontal(bars("max_position_error_m"), bars("max_speed_error_m_s")),
         ),
         name="Overview",
     )
+    radio = (
+        plot("Position of the neighbours [m]", f"bus/neighbour_position/{current}"),
+        plot("Speed of the neighbours [m/s]", f"bus/neighbour_speed/{current}"),
+        plot("Age of the radio data [s]", f"bus/neighbour_age/{current}"),
+    )
+    signals = rrb.Grid(
+        plot("Position [m]", f"bus/position/{current}", "reference/position_m"),
+        plot(
+            "Acceleration [m/s²]",
+            f"bus/acceleration/{current}",
+            "reference/acceleration_m_s2",
+            f"truth/acceleration_m_s2/{current}",
+        ),
+        plot("Force [N]", f"bus/force/{current}", f"truth/force_n/{current}"),
+        plot(
+            "Position error [m]",
+            f"bus/position_error/{current}",
+            f"truth/position_error_m/{current}",
+        ),
+        plot("Speed error [m/s]", f"bus/speed_error/{current}", f"truth/speed_error_m_s/{current}"),
+        plot("Distance to the ATP target [m]", f"bus/target_distance/{current}"),
+        *(radio if neighbours else ()),
+        grid_columns=3,
+        name="Signals",
+    )
+    runs = rrb.Vertical(
+        rrb.Horizontal(*(plot(title_of(key), f"runs/{key}", legend=False) for key in BARS[:2])),
+        rrb.Horizontal(*(plot(title_of(key), f"runs/{key}", legend=False) for key in BARS[2:])),
+        rrb.TextDocumentView(name="Summary", origin="/runs/table"),
+        name="Errors by run (timeline run)",
+    )
+    log = rrb.Vertical(
+        rrb.StateTimelineView(name="All states", origin=f"/bus/state/{current}", time_view=whole),
+        rrb.TextLogView(name="Events", origin="/events"),
+        name="Events",
+    )
     return rrb.Blueprint(
-        overview,
-        rrb.TimePanel(state="collapsed", timeline="time"),
+        rrb.Tabs(overview, signals, runs, log),
+        rrb.TimePanel(state="collapsed", timeline="time", play_state="paused"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         auto_views=False,

@@ -50,10 +50,26 @@ class Train(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     coupler_cosine_m: list[float]  # amplitude of cos(t)
     substeps: int = 5
 
+    def __post_init__(self) -> None:
+        cars = len(self.masses_kg)
+        if not 1 <= cars <= CARS_MAX:
+            raise ValueError(f"masses_kg has {cars} cars, expected 1 to {CARS_MAX}")
+        if len(self.effectiveness) != cars:
+            raise ValueError(f"effectiveness: expected {cars} numbers, one a car")
+        if len(self.coupler_sine_m) != cars - 1 or len(self.coupler_cosine_m) != cars - 1:
+            raise ValueError(f"coupler_sine_m, coupler_cosine_m: expected {cars - 1} numbers each")
+        if not all(1 <= car <= cars for car in self.motor_cars):
+            raise ValueError(f"motor_cars: expected numbers from 1 to {cars}")
+
     @property
     def mass_kg(self) -> float:
         """Mass of the whole train."""
         return sum(self.masses_kg)
+
+    @property
+    def rear_offset_m(self) -> float:
+        """Distance of the sensors at front and rear, at rest."""
+        return self.pitch_m * (len(self.masses_kg) - 1)
 
 
 OSCILLATOR = np.dtype([("sine", np.float64), ("cosine", np.float64)])

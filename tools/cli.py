@@ -1,0 +1,230 @@
+"""The command line `ato-hil`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+app = typer.Typer(
+    name="ato-hil",
+    help="Train control laws as fixed-point firmware, hardware-in-the-loop on a virtual CAN bus.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+console = Console(highlight=False)
+errors = Console(stderr=True, highlight=False)
+
+EXIT_BAD_INPUT = 1
+EXIT_ENDED_EARLY = 3
+EXIT_INTERRUPTED = 130
+
+
+class Mode(StrEnum):
+    """Where the controller runs."""
+
+    hil = "hil"
+    sil = "sil"
+    mil = "mil"
+
+
+class Pace(StrEnum):
+    """Who keeps the time."""
+
+    lockstep = "lockstep"
+
+
+# Column of the table: heading, key of the row, factor, format.
+COLUMNS = (
+    ("run", "run", 1, "{:d}"),
+    ("delta\nm/s", "max_delta_m_s", 1, "{:.4f}"),
+    ("speed error\nmm/s", "max_speed_error_m_s", 1e3, "{:.3f}"),
+    ("position error\nmm", "max_position_error_m", 1e3, "{:.3f}"),
+    ("rms position\nmm", "rms_position_error_m", 1e3, "{:.3f}"),
+    ("stop error\nmm", "stop_error_m", 1e3, "{:.2f}"),
+    ("acceleration\nm/s²", "max_acceleration_m_s2", 1, "{:.3f}"),
+    ("margin to limit\nm/s", "overspeed_margin_m_s", 1, "{:.3f}"),
+    ("energy\nkWh/t", "energy_kwh_per_t", 1, "{:.4f}"),
+    ("ticks/s", "ticks_per_s", 1, "{:,.0f}"),
+)
+
+
+class Screen:
+    """Progress bar and table of a session; a plain line a run where there is no terminal."""
+
+    def __init__(self, runs: int, ticks: int) -> None:
+        self.runs, self.ticks = runs, ticks
+        self.rows: list[dict[str, Any]] = []
+        self.faults = 0
+        self.bar = Progress(
+            TextColumn("run {task.fields[run]}/{task.fields[runs]}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f} %  {task.fields[rate]} ticks/s  {task.fields[last]}"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self.task = self.bar.add_task("run", total=runs * ticks, run=1, runs=runs, rate="-", last="")
+
+    def note(self, text: str) -> None:
+        """One line above the bar."""
+        self.bar.console.print(text, style="dim", soft_wrap=True)
+
+    def progress(self, run: int, tick: int) -> None:
+        """Moves the bar."""
+        done = (run - 1) * self.ticks + tick
+        speed = self.bar.tasks[0].speed
+        rate = f"{speed:,.0f}" if speed else "-"
+        self.bar.update(self.task, completed=done, run=run, rate=rate)
+
+    def row(self, row: dict[str, Any]) -> None:
+        """Keeps a run's row and shows its errors beside the bar."""
+        self.rows.append(row)
+        self.faults += len(row["faults"])
+        last = f"last: {row['max_position_error_m'] * 1e3:.2f} mm, {self.faults} faults"
+        self.bar.update(self.task, completed=row["run"] * self.ticks, last=last)
+        if not console.is_terminal:
+            cells = [f"{name.split(chr(10))[0]} {_cell(row, key, f, s)}" for name, key, f, s in COLUMNS]
+            console.print("  ".join(cells + [_faults(row)]).rstrip(), soft_wrap=True)
+
+
+def _cell(row: dict[str, Any], key: str, factor: float, text: str) -> str:
+    value = row[key]
+    return "-" if value is None else text.format(value if isinstance(value, int) else value * factor)
+
+
+def _faults(row: dict[str, Any]) -> str:
+    return ", ".join(row["faults"])
+
+
+def _print_table(title: str, rows: list[dict[str, Any]]) -> None:
+    table = Table(title=title, title_justify="left", header_style="bold")
+    for name, _key, _factor, _text in COLUMNS:
+        table.add_column(name, justify="right")
+    table.add_column("faults")
+    for row in rows:
+        table.add_row(*(_cell(row, key, f, s) for _n, key, f, s in COLUMNS), _faults(row))
+    console.print(table)
+
+
+def _fail(message: str, code: int) -> typer.Exit:
+    errors.print(f"ato-hil: {message}", style="red", soft_wrap=True)
+    return typer.Exit(code)
+
+
+@app.command()
+def run(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario (`ato-hil list`) or a .toml file.")],
+    law: Annotated[str | None, typer.Option(help="Control law; the scenario's by default.")] = None,
+    runs: Annotated[int | None, typer.Option(min=1, help="Runs in a row; the scenario's by default.")] = None,
+    mode: Annotated[Mode, typer.Option(help="hil: processes on a bus; sil: one compiled loop; mil: interpreted, checked.")] = Mode.hil,
+    bus: Annotated[str, typer.Option(help="auto, hub, hub:NAME, vcan, socketcan:NAME or INTERFACE:CHANNEL of python-can.")] = "auto",
+    pace: Annotated[Pace, typer.Option(help="lockstep: as fast as the bus, deterministic.")] = Pace.lockstep,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of noise and disturbance.")] = 1,
+    out: Annotated[Path | None, typer.Option(help="Folder of trace.rrd and summary.json; runs/SCENARIO-LAW-MODE by default.")] = None,
+    memory: Annotated[Path | None, typer.Option(help="Learning memory: read if it exists, written after each run.")] = None,
+    trace: Annotated[bool, typer.Option(help="Write trace.rrd.")] = True,
+) -> None:
+    """Run a scenario: the train follows its profile, run by run."""
+    if mode is Mode.mil and os.environ.get("ATO_HIL_INTERPRETED") != "1":
+        # The choice is made when the steps are imported, so in a process that has not imported them.
+        environment = {**os.environ, "ATO_HIL_INTERPRETED": "1"}
+        os.execve(sys.executable, [sys.executable, "-m", "tools.cli", *sys.argv[1:]], environment)
+    try:
+        _run(scenario, law, runs, mode, bus, seed, out, memory, trace)
+    except KeyboardInterrupt:
+        raise _fail("interrupted; the runs so far are kept", EXIT_INTERRUPTED) from None
+    except typer.Exit:
+        raise
+    except ValueError as error:
+        # Bad input of every kind (scenario, law, DBC, bus, memory file) is a ValueError of ours with one line.
+        if type(error).__module__.split(".")[0] not in ("can_dbc", "controller", "plant_sim", "tools"):
+            raise
+        raise _fail(str(error), EXIT_BAD_INPUT) from None
+
+
+def _run(
+    scenario: str,
+    law: str | None,
+    runs: int | None,
+    mode: Mode,
+    bus: str,
+    seed: int,
+    out: Path | None,
+    memory: Path | None,
+    trace: bool,
+) -> None:
+    from plant_sim.scenario import load
+    from tools import session
+    from tools.hil import RunError
+
+    loaded = load(scenario)
+    law = law or loaded.scenario.law
+    count = runs or loaded.scenario.runs
+    folder = out or Path("runs") / f"{loaded.name}-{law}-{mode.value}"
+    options = session.Options(scenario, law, count, mode.value, bus, seed, folder, memory, trace)
+    screen = Screen(count, loaded.ticks)
+    console.print(f"{loaded.scenario.title}: law {law}, {count} runs of {loaded.ticks} ticks, {mode.value}")
+    try:
+        with screen.bar:
+            summary = session.run(options, screen)
+    except RunError as error:
+        if screen.rows and console.is_terminal:
+            _print_table(f"{loaded.name}, {law}", screen.rows)
+        raise _fail(f"{error}; the runs so far are in {folder}", EXIT_ENDED_EARLY) from None
+    if console.is_terminal:
+        _print_table(f"{loaded.name}, {law}, {mode.value}", screen.rows)
+    console.print(f"digest {summary['digest']}")
+    console.print(f"summary {folder / 'summary.json'}", soft_wrap=True)
+    if trace:
+        console.print(f"trace   {folder / 'trace.rrd'}   (open it with: rerun {folder / 'trace.rrd'})", soft_wrap=True)
+
+
+@app.command("list")
+def list_scenarios() -> None:
+    """List the scenarios and the laws that each has gains for."""
+    from plant_sim.scenario import ScenarioError, load, scenario_names
+
+    table = Table("scenario", "laws (default first)", "run", "what it is", header_style="bold")
+    try:
+        for name in scenario_names():
+            loaded = load(name)
+            default = loaded.scenario.law
+            others = sorted(set(loaded.scenario.laws) - {default})
+            length = f"{loaded.profile.position_m[-1]:.0f} m, {loaded.ticks * loaded.scenario.period_s:.0f} s"
+            table.add_row(name, " ".join([default, *others]), length, loaded.scenario.title)
+    except ScenarioError as error:
+        raise _fail(str(error), EXIT_BAD_INPUT) from None
+    console.print(table)
+
+
+@app.command()
+def doctor() -> None:
+    """Say what works on this machine, and what to do about what does not."""
+    from tools import doctor as checks
+
+    findings = checks.examine()
+    table = Table("what", "state", "how it was checked, and what to do", header_style="bold")
+    for finding in findings:
+        colour = {"works": "green", "absent": "yellow", "broken": "red"}[finding.state]
+        table.add_row(finding.what, f"[{colour}]{finding.state}[/]", finding.text)
+    console.print(table)
+    if any(finding.state == "broken" for finding in findings):
+        raise typer.Exit(EXIT_BAD_INPUT)
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

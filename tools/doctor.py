@@ -1,0 +1,121 @@
+"""What works on this machine: compiler, its cache, buses, viewer."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    state: str  # works | absent (optional) | broken (needed)
+    text: str
+
+
+def examine() -> list[Finding]:
+    """All findings, in the order in which a run needs them."""
+    return [
+        _python(),
+        _compiler(),
+        _cache(),
+        _dbc(),
+        _hub(),
+        _vcan0(),
+        _private_vcan(),
+        _viewer(),
+    ]
+
+
+def _python() -> Finding:
+    return Finding("Python", "works", f"{platform.python_version()} on {platform.machine()}, {sys.platform}")
+
+
+def _compiler() -> Finding:
+    try:
+        import numba
+
+        from can_dbc.step import int64, step
+
+        @step
+        def probe(value: int) -> int:
+            return int64(value) + 1
+
+        right = probe(41) == 42
+    except Exception as error:  # whatever the compiler raises is the finding
+        return Finding("compiler", "broken", f"numba cannot compile here: {' '.join(str(error).split())[:200]}")
+    return Finding("compiler", "works" if right else "broken", f"numba {numba.__version__} compiled a step")
+
+
+def _cache() -> Finding:
+    from can_dbc.step import cache_directory
+
+    folder = cache_directory()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        return Finding(
+            "compiler cache",
+            "broken",
+            f"{folder}: {error.strerror}; set NUMBA_CACHE_DIR to a folder that can be written",
+        )
+    return Finding("compiler cache", "works", f"{folder} can be written; the first run compiles, later ones load")
+
+
+def _dbc() -> Finding:
+    try:
+        from can_dbc.codec import MESSAGE_COUNT
+        from can_dbc.step import dbc_path
+    except ValueError as error:
+        return Finding("DBC", "broken", str(error))
+    return Finding("DBC", "works", f"{dbc_path().name}: {MESSAGE_COUNT} messages")
+
+
+def _hub() -> Finding:
+    import can
+
+    from can_dbc.bus import BusError, open_bus, recv_frames, send_frames
+
+    try:
+        with open_bus("hub:doctor") as one, open_bus("hub:doctor") as other:
+            send_frames(one, [(0x7FF, 1)])
+            heard = recv_frames(other, 1.0) == [(0x7FF, 1)]
+    except (BusError, can.CanError, OSError) as error:
+        return Finding("bus hub", "broken", f"the embedded hub does not work here: {error}")
+    return Finding("bus hub", "works" if heard else "broken", "a frame went from node to node")
+
+
+def _vcan0() -> Finding:
+    from can_dbc.bus import socketcan_reason
+
+    reason = socketcan_reason("vcan0")
+    if not reason:
+        return Finding("bus socketcan:vcan0", "works", "the interface exists; `auto` takes it")
+    return Finding(
+        "bus socketcan:vcan0",
+        "absent",
+        f"{reason}; on a kernel with CAN: sudo modprobe vcan; sudo ip link add dev vcan0 type vcan; sudo ip link set up vcan0",
+    )
+
+
+def _private_vcan() -> Finding:
+    from can_dbc.bus import private_vcan_reason
+
+    reason = private_vcan_reason()
+    return Finding("bus vcan", "absent" if reason else "works", reason or "a private vcan can be made")
+
+
+def _viewer() -> Finding:
+    beside = Path(sys.executable).with_name("rerun")
+    found = shutil.which("rerun") or (str(beside) if beside.exists() else None)
+    if found is None:
+        return Finding("viewer", "absent", "no `rerun` command; pip install rerun-sdk brings it")
+    return Finding("viewer", "works", f"{Path(found).name} is installed; on a machine with no screen: rerun --serve-web --bind 127.0.0.1 TRACE")

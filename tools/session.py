@@ -1,0 +1,269 @@
+"""One session: the runs of one scenario and law in one mode, with their trace and summary.
+
+Modes: `sil` (one compiled loop), `mil` (the same loop interpreted, in a process started with ATO_HIL_INTERPRETED=1), `hil` (three
+processes on a bus). All give the same digest.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import time
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from can_dbc.bus import choose_bus, open_bus, recv_frames
+from controller.interface import fault_names
+from controller.registry import load_law
+from plant_sim.scenario import Loaded, load
+from tools import hil, metrics, setup, sil
+from tools.frames import Digest
+from tools.hil import RunError
+
+SCHEMA = 1
+RUNS_MAX = 4095  # Iteration has 12 bits
+
+
+class SessionError(ValueError):
+    """The session cannot begin; one line."""
+
+
+class Listener(Protocol):
+    """Who watches a session."""
+
+    def note(self, text: str) -> None:
+        """Something to know, once."""
+
+    def progress(self, run: int, tick: int) -> None:
+        """Where the session is."""
+
+    def row(self, row: dict[str, Any]) -> None:
+        """A run is done."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the user asked for."""
+
+    scenario: str
+    law: str | None
+    runs: int | None
+    mode: str  # hil | sil | mil
+    bus: str
+    seed: int
+    out: Path
+    memory: Path | None
+    trace: bool = True
+
+
+@dataclass
+class Session:
+    """A session under way; `summary` is what summary.json holds."""
+
+    options: Options
+    loaded: Loaded
+    law: str
+    runs: int
+    listener: Listener
+    summary: dict[str, Any] = field(default_factory=dict)
+
+
+def run(options: Options, listener: Listener) -> dict[str, Any]:
+    """Runs the session; returns and writes the summary.
+
+    Raises ScenarioError, LawError, CalibrationError, BusError, MemoryFileError, SessionError for bad input, RunError if a run ends early
+    (the summary then holds the runs that were completed and the reason), KeyboardInterrupt likewise.
+    """
+    loaded = load(options.scenario)
+    law = options.law or loaded.scenario.law
+    load_law(law)
+    runs = options.runs or loaded.scenario.runs
+    if not 1 <= runs <= RUNS_MAX:
+        raise SessionError(f"{runs} runs, expected 1 to {RUNS_MAX}")
+    calibration = setup.calibration_for(loaded, law)
+    _prepare(options.out)
+    session = Session(options, loaded, law, runs, listener)
+    session.summary = {
+        "schema": SCHEMA,
+        "scenario": loaded.name,
+        "law": law,
+        "mode": options.mode,
+        "bus": "none",
+        "pace": "lockstep",
+        "seed": options.seed,
+        "digest": "",
+        "controller": {"state_bytes": 0, "memory_bytes": 0},
+        "runs": [],
+    }
+    try:
+        if options.mode == "hil":
+            _run_hil(session, calibration)
+        else:
+            _run_in_process(session, calibration)
+    except RunError as error:
+        session.summary["ended_early"] = str(error)
+        raise
+    except KeyboardInterrupt:
+        session.summary["ended_early"] = "interrupted"
+        raise
+    finally:
+        _write_summary(options.out / "summary.json", session.summary)
+    return session.summary
+
+
+def _prepare(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name in ("summary.json", "trace.rrd"):
+            (out / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise SessionError(f"{out}: cannot write there: {error.strerror}") from None
+
+
+def _write_summary(path: Path, summary: dict[str, Any]) -> None:
+    temporary = path.with_suffix(".new")
+    temporary.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def _finish_run(
+    session: Session, run: int, frames: np.ndarray, truth: np.ndarray, seconds: float, faults: list[str]
+) -> dict[str, Any]:
+    """The row of a run, added to the summary and shown."""
+    measured = metrics.run_metrics(
+        session.loaded,
+        truth,
+        sil.commanded_force_n(frames, len(truth)),
+        setup.error_weight(session.loaded, session.law),
+    )
+    row = {"run": run, **measured, "ticks_per_s": len(truth) / seconds, "faults": faults}
+    session.summary["runs"].append(row)
+    session.listener.row(row)
+    return row
+
+
+def _run_in_process(session: Session, calibration: Any) -> None:
+    options, loaded = session.options, session.loaded
+    digest = Digest()
+    writer = _trace_writer(session) if options.trace else None
+    try:
+        for result, node in sil.run(
+            loaded,
+            calibration,
+            runs=session.runs,
+            seed=options.seed,
+            memory_file=options.memory,
+            progress=session.listener.progress,
+        ):
+            digest.update(result.frames)
+            session.summary["digest"] = digest.hex()
+            session.summary["controller"] = {
+                "state_bytes": node.state_bytes,
+                "memory_bytes": node.memory_bytes,
+            }
+            row = _finish_run(
+                session, result.run, result.frames, result.truth, result.seconds, result.faults
+            )
+            if writer is not None:
+                writer.frames(result.run, result.frames)
+                writer.truth(result.run, result.truth)
+                writer.run_summary(result.run, row)
+    finally:
+        if writer is not None:
+            writer.close()
+
+
+def trace_settings(loaded: Loaded, law: str) -> dict[str, Any]:
+    """What a trace needs to know, as TraceWriter takes it."""
+    module = load_law(law)
+    return {
+        "title": f"{loaded.name} {law}",
+        "period_s": loaded.scenario.period_s,
+        "estimates": [f"{name} [{unit}]" for name, unit, _q in module.ESTIMATES],
+        "cars": len(loaded.scenario.train.effectiveness) if loaded.scenario.control.distribute else 0,
+    }
+
+
+def _trace_writer(session: Session) -> Any:
+    from tools.trace import TraceWriter
+
+    return TraceWriter(
+        session.options.out / "trace.rrd",
+        reference=session.loaded.profile,
+        **trace_settings(session.loaded, session.law),
+    )
+
+
+def _run_hil(session: Session, calibration: Any) -> None:
+    options, loaded = session.options, session.loaded
+    choice = choose_bus(options.bus)
+    if choice.interface == "virtual":
+        raise SessionError(f"bus {options.bus!r} lives inside one process; HIL needs one between processes")
+    session.summary["bus"] = choice.name
+    session.listener.note(f"bus {choice.name}: {choice.reason}")
+    _refuse_busy_bus(choice.name)
+    with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch:
+        kept = Path(scratch)
+        events = hil.run(
+            scenario=str(loaded.path),
+            calibration=calibration,
+            bus=choice.name,
+            runs=session.runs,
+            seed=options.seed,
+            out=options.out,
+            memory_file=options.memory,
+            recorder_arguments=_recorder_arguments(session, kept),
+        )
+        with closing(events):  # whatever ends the session ends the nodes
+            for node, event, bench in events:
+                _on_event(session, bench, node.name, event, kept)
+
+
+def _refuse_busy_bus(name: str) -> None:
+    """Two sessions on one bus would answer each other."""
+    with open_bus(name) as bus:
+        time.sleep(0.1)
+        if recv_frames(bus, 0.0):
+            raise SessionError(f"bus {name!r} carries other traffic; choose another, e.g. --bus hub:second")
+
+
+def _on_event(
+    session: Session, bench: hil.Bench, name: str, event: dict[str, Any], kept: Path
+) -> None:
+    kind = event["event"]
+    if kind == "progress":
+        session.listener.progress(event["run"], event["tick"])
+    elif kind == "ready" and name == "controller":
+        session.summary["controller"] = {
+            "state_bytes": event["state_bytes"],
+            "memory_bytes": event["memory_bytes"],
+        }
+    elif name in ("plant", "recorder") and kind == "run":
+        plant, recorder = bench.nodes["plant"].said, bench.nodes["recorder"].said
+        run = event["run"]
+        if plant.get("run", {}).get("run") == run and recorder.get("run", {}).get("run") == run:
+            _on_run(session, bench, plant["run"], recorder["run"], kept)
+
+
+def _on_run(
+    session: Session, bench: hil.Bench, plant: dict[str, Any], recorder: dict[str, Any], kept: Path
+) -> None:
+    """Plant and recorder have both finished a run."""
+    run = plant["run"]
+    session.summary["digest"] = recorder["digest"]
+    lost = {name: count for name, count in recorder["lost"].items() if count}
+    if lost:
+        session.listener.note(f"run {run}: the recorder missed frames: {lost}")
+    frames_file = kept / f"frames_{run}.npy"
+    frames = np.load(frames_file)
+    truth = np.load(plant["file"])
+    row = _finish_run(session, run, frames, truth, plant["seconds"], fault_names(plant["faults"]))
+    frames_file.unlink()
+    node = bench.nodes["recorder"]
+    node.command(command="truth", run=run, file=plant["file"])
+    node.command(command="summary", run=run, row=row)
