@@ -5,8 +5,8 @@ vcan interface, where the kernel has none. The first node starts the hub process
 (`can_dbc.hub_server`, which also describes the protocol), the last one to leave ends it.
 
 The sockets live in a directory that only its owner can enter: `$XDG_RUNTIME_DIR/ato-hil`, else
-`ato-hil-UID` in the folder for temporary files. A lock on that directory makes the election of a
-hub free of races, so that no lock files are needed.
+`ato-hil-UID` in the folder for temporary files. A lock on that directory itself makes the election
+of a hub free of races; there are no lock files.
 """
 
 import contextlib
@@ -434,7 +434,7 @@ def _remove_stale_socket(path: Path) -> bool:
 
 @contextlib.contextmanager
 def _directory_lock(directory: Path) -> Iterator[None]:
-    """Hold the lock under which hubs come and go; it vanishes with the process that holds it."""
+    """Hold the lock under which hubs are elected; it vanishes with the process that holds it."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)

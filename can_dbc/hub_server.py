@@ -22,7 +22,7 @@ Wire protocol, version `PROTOCOL`:
 - Hub to node: the same, each after its timestamp (uint64, ns since the epoch).
 """
 
-import fcntl
+import contextlib
 import json
 import os
 import selectors
@@ -94,42 +94,33 @@ def main() -> None:
     path = os.path.abspath(sys.argv[1])
     try:
         listener = socket.socket(fileno=os.dup(0))
-        identity = file_identity(path)
-        directory = os.open(os.path.dirname(path), os.O_RDONLY)
+        identity = os.stat(path)
     except OSError as error:
         sys.exit(f"hub_server: standard input must be the socket that listens on {path}: {error}")
     become_daemon()
     signal.signal(signal.SIGTERM, lambda signum, frame: sys.exit(0))
     try:
-        serve(listener, directory)
+        serve(listener)
     finally:
-        # A hub whose file was deleted must not delete that of the hub that was elected since.
-        if identity is not None and file_identity(path) == identity:
-            os.unlink(path)
+        # Who has connected by now is disconnected when this process ends, and elects the next hub.
+        # A hub whose file was deleted must not delete that of the hub elected since.
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.stat(path), identity):
+                os.unlink(path)
 
 
-def serve(listener: socket.socket, directory: int) -> None:
-    """Pass frames between the nodes that connect to `listener`, until the last one has left.
-
-    Returns with the lock on `directory` held, so that no node can elect another hub between the
-    decision to leave and the deletion of the socket file.
-    """
+def serve(listener: socket.socket) -> None:
+    """Pass frames between the nodes that connect to `listener`, until the last one has left."""
     listener.setblocking(False)
     hub = Hub(listener, selectors.DefaultSelector())
     hub.selector.register(listener, selectors.EVENT_READ)
     leave_at = time.monotonic() + LINGER_S
-    while True:
+    while hub.nodes or (time_left := leave_at - time.monotonic()) > 0:
         if hub.nodes:
             serve_once(hub, None)
             leave_at = time.monotonic() + LINGER_S
-        elif (time_left := leave_at - time.monotonic()) > 0:
-            serve_once(hub, time_left)
         else:
-            fcntl.flock(directory, fcntl.LOCK_EX)
-            if not hub.selector.select(0):
-                return
-            fcntl.flock(directory, fcntl.LOCK_UN)
-            serve_once(hub, 0)
+            serve_once(hub, time_left)
 
 
 def serve_once(hub: Hub, timeout_s: float | None) -> None:
@@ -305,15 +296,6 @@ def overrun_record(node: Node) -> bytes:
     frame = FD_FRAME_STRUCT if node.fd else FRAME
     stamp = STAMP.pack(time.time_ns())
     return stamp + frame.pack(ERROR | _CONTROLLER_PROBLEM, 8, OVERRUN, data)
-
-
-def file_identity(path: str) -> tuple[int, int] | None:
-    """Device and inode of a file, None when there is none."""
-    try:
-        status = os.stat(path)
-    except FileNotFoundError:
-        return None
-    return status.st_dev, status.st_ino
 
 
 def become_daemon() -> None:

@@ -1,7 +1,8 @@
 """The cyclic task: mailboxes in, mailboxes out, once a control period.
 
-Contract of `tick(params, profile, state, memory, rx, tx)`: a step. It reads `rx` (mailboxes, cleared by the caller after the
-tick), `params`, `profile`; writes `state`, `memory`, `tx`; takes bounded time; never raises, whatever is in the mailboxes.
+Contract of `tick(params, profile, state, memory, rx, tx, period)`: a step. It reads `rx` (mailboxes, cleared by the caller after
+the tick), `params`, `profile`; writes `state`, `memory`, `tx`; takes bounded time; never raises, whatever is in the mailboxes.
+`period` is 1 when a control period has passed, 0 to look at RUN_CTRL alone.
 In order: decode and end-to-end check, ages, the onboard reference, the law, the guard, distribution over the cars, encode
 and protect. The process around it moves payloads and stores the learning memory, nothing else.
 """
@@ -297,7 +298,7 @@ def estimate_word(index: Any, exponent: Any, value: Any) -> Any:
 
 
 def build_tick(law_step: Any) -> Any:
-    """The cyclic task around one law, as a step `tick(params, profile, state, memory, rx, tx)`.
+    """The cyclic task around one law, as a step `tick(params, profile, state, memory, rx, tx, period)`.
 
     Shapes: params and state one record of `params_dtype`/`state_dtype`; profile [segments] of reference.SEGMENT; memory
     [2, cells, words]; rx, tx [MESSAGE_COUNT] of codec.MAILBOX.
@@ -376,7 +377,9 @@ def build_tick(law_step: Any) -> Any:
         core.tick = tick + 1
 
     @step
-    def tick(params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any) -> None:
+    def tick(
+        params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any, period: Any
+    ) -> None:
         core = state.core
         if receive(state.links[RUN_CTRL.index], rx[RUN_CTRL.index], RUN_CTRL.data_id):
             word = int64(rx[RUN_CTRL.index].payload)
@@ -391,7 +394,7 @@ def build_tick(law_step: Any) -> Any:
                 if wanted == ARMED:
                     begin(params, profile, state)
                 send(core, tx, ATO_STATUS, status_word(params, core))
-        if int64(core.run_state) == RUNNING:
+        if int64(core.run_state) == RUNNING and period == 1:
             read_inputs(state, rx)
             run_tick(params, profile, state, cells, tx)
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from can_dbc.codec import mailboxes
-from can_dbc.step import INTERPRETED
+from can_dbc.step import INTERPRETED, step
 from controller import memory, store
 from controller.calibration import Calibration
 from controller.firmware import build_tick, state_dtype
@@ -22,17 +22,23 @@ from controller.registry import law_step, load_law
 
 @dataclass
 class Controller:
-    """Buffers of one controller; `params` and `state` are the single records of their arrays."""
+    """Buffers of one controller."""
 
     calibration: Calibration
-    tick: Any
-    params: Any
-    state: Any
+    tick: Any  # the step of firmware.build_tick, for loops that are compiled around it
+    call: Any  # the same for Python: takes params and state as arrays of one record
+    params: Any  # (1,) of firmware.params_dtype
+    profile: Any  # (segments,) of reference.SEGMENT
+    state: Any  # (1,) of firmware.state_dtype
     cells: np.ndarray  # [2, cells, words]
-    rx: np.ndarray  # mailboxes
-    tx: np.ndarray
+    rx: Any  # mailboxes
+    tx: Any
     memory_file: Path | None
-    state_bytes: int
+
+    @property
+    def state_bytes(self) -> int:
+        """Bytes of the firmware's state."""
+        return int(self.state.nbytes)
 
     @property
     def memory_bytes(self) -> int:
@@ -40,15 +46,21 @@ class Controller:
         return int(self.cells.nbytes)
 
 
-def record(array: np.ndarray) -> Any:
-    """The first record of a structured array, by reference, in the form that steps take."""
-    return array.view(np.recarray)[0] if INTERPRETED else array[0]
+def rows(array: np.ndarray) -> Any:
+    """A structured array in the form that steps take."""
+    return array.view(np.recarray) if INTERPRETED else array
 
 
-def boxes() -> np.ndarray:
-    """Empty mailboxes in the form that steps take."""
-    empty = mailboxes()
-    return empty.view(np.recarray) if INTERPRETED else empty
+def callable_tick(tick: Any) -> Any:
+    """`tick` for Python. Arrays are ten times cheaper to pass than records: a record is described field by field."""
+
+    @step
+    def call(
+        params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any, period: Any
+    ) -> None:
+        tick(params[0], profile, state[0], cells, rx, tx, period)
+
+    return call
 
 
 def build(calibration: Calibration, memory_file: Path | None = None) -> Controller:
@@ -64,48 +76,43 @@ def build(calibration: Calibration, memory_file: Path | None = None) -> Controll
     )
     if memory_file is not None and memory_file.exists():
         cells[0] = store.load(memory_file, calibration, cells.shape[1:]).cells
+    tick = build_tick(law_step(module))
     return Controller(
         calibration=calibration,
-        tick=build_tick(law_step(module)),
-        params=record(calibration.params),
-        state=record(state),
+        tick=tick,
+        call=callable_tick(tick),
+        params=rows(calibration.params),
+        profile=rows(calibration.profile),
+        state=rows(state),
         cells=cells,
-        rx=boxes(),
-        tx=boxes(),
+        rx=rows(mailboxes()),
+        tx=rows(mailboxes()),
         memory_file=memory_file,
-        state_bytes=int(state.nbytes),
     )
 
 
-def cycle(node: Controller) -> None:
-    """One tick, then what a change of the run state asks for: a run starts or ends its learning.
+def cycle(node: Controller, period: int) -> None:
+    """One tick (`period` as in firmware.tick), then what a change of the run state asks for: a run starts or ends its learning.
 
     The memory is stored before the caller sends `tx`, so that ATO_STATUS(ended) says that it is.
     """
-    before = int(node.state["core"]["run_state"])
-    profile = node.calibration.profile
-    node.tick(
-        node.params,
-        profile.view(np.recarray) if INTERPRETED else profile,
-        node.state,
-        node.cells,
-        node.rx,
-        node.tx,
-    )
-    now = int(node.state["core"]["run_state"])
+    core = node.state[0]["core"]
+    before = int(core["run_state"])
+    node.call(node.params, node.profile, node.state, node.cells, node.rx, node.tx, period)
+    now = int(core["run_state"])
     if now == ARMED:
-        memory.start_run(node.state["memory"], node.cells)
+        memory.start_run(node.state[0]["memory"], node.cells)
     elif now == ENDED and before != ENDED:
         finish_run(node)
 
 
 def finish_run(node: Controller) -> None:
     """Closes the run's learning: kept if no fault blocks it, and written to the memory file."""
-    core = node.state["core"]
+    core = node.state[0]["core"]
     keep = int(core["faults"]) & FAULTS_THAT_BLOCK_LEARNING == 0
-    memory.end_run(node.params["memory"], node.state["memory"], node.cells, keep)
+    memory.end_run(node.params[0]["memory"], node.state[0]["memory"], node.cells, keep)
     if node.memory_file is not None and node.cells.size:
-        generation = int(node.state["memory"]["generation"])
+        generation = int(node.state[0]["memory"]["generation"])
         store.save(
             node.memory_file, node.calibration, node.cells[generation], int(core["iteration"])
         )

@@ -1,7 +1,7 @@
 """The controller process: payloads from the bus into the mailboxes, a tick, payloads from the mailboxes to the bus.
 
-Started with a calibration file; knows nothing of the plant. A tick starts with TRAIN_POSITION inside a run, and with RUN_CTRL outside
-one. Internal: `ato-hil run` starts it.
+Started with a calibration file; knows nothing of the plant. TRAIN_POSITION, the plant's last frame of a tick, starts the
+control period; a RUN_CTRL that arms or ends a run is answered at once. Internal: `ato-hil run` starts it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import can
 
 from can_dbc.bus import BusError, open_bus, recv_frames, send_frames
 from can_dbc.child import Stop, follow_parent, tell
-from can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGES, RUN_CTRL, TRAIN_POSITION
+from can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGES, RUN_CTRL, TRAIN_POSITION, get
 from controller import calibration, node, store
 from controller.interface import RUNNING
 from controller.quantise import CalibrationError
@@ -27,8 +27,7 @@ FRAME_IDS = [message.frame_id for message in MESSAGES]
 def serve(controller: node.Controller, bus: can.BusABC, stop: Stop) -> None:
     """Answers the plant until `stop`. Raises can.CanError if the bus is gone."""
     rx_payload, rx_fresh = controller.rx["payload"], controller.rx["fresh"]
-    tx, tx_fresh = controller.tx, controller.tx["fresh"]
-    core = controller.state["core"]
+    tx_payload, tx_fresh = controller.tx["payload"], controller.tx["fresh"]
     while not stop.requested:
         for frame_id, payload in recv_frames(bus, RECEIVE_TIMEOUT_S):
             index = INDEX_OF_FRAME_ID.get(frame_id)
@@ -36,15 +35,16 @@ def serve(controller: node.Controller, bus: can.BusABC, stop: Stop) -> None:
                 continue
             rx_payload[index] = payload
             rx_fresh[index] = 1
-            outside_run = frame_id == RUN_CTRL.frame_id and core["run_state"] != RUNNING
-            if frame_id != TRAIN_POSITION.frame_id and not outside_run:
+            if frame_id == TRAIN_POSITION.frame_id:
+                node.cycle(controller, 1)
+            elif frame_id == RUN_CTRL.frame_id and get(payload, RUN_CTRL.RunState) != RUNNING:
+                node.cycle(controller, 0)
+            else:
                 continue
-            node.cycle(controller)
-            rx_fresh[:] = 0
-            answers = [
-                (FRAME_IDS[i], word) for i, (word, fresh, _) in enumerate(tx.tolist()) if fresh
-            ]
-            tx_fresh[:] = 0
+            rx_fresh.fill(0)
+            words = tx_payload.tolist()
+            answers = [(FRAME_IDS[i], words[i]) for i in tx_fresh.nonzero()[0].tolist()]
+            tx_fresh.fill(0)
             if answers:
                 send_frames(bus, answers)
 
@@ -60,8 +60,8 @@ def main() -> int:
     follow_parent()
     try:
         controller = node.build(calibration.load(arguments.calibration), arguments.memory)
-        node.cycle(controller)  # compiles, or loads what was compiled before
-        controller.tx["fresh"][:] = 0
+        node.cycle(controller, 0)  # compiles, or loads what was compiled before
+        controller.tx["fresh"].fill(0)
         bus = open_bus(arguments.bus)
     except (CalibrationError, LawError, store.MemoryFileError, BusError) as error:
         tell("error", message=str(error))

@@ -100,6 +100,10 @@ class Pulse:
     first: int  # tick
     rows: NDArray[np.int64]  # jerk by tick
 
+    @property
+    def end(self) -> int:
+        return self.first + len(self.rows)
+
 
 @dataclass(frozen=True)
 class PlacedRamp:
@@ -126,16 +130,14 @@ def plan_profile(plan: ProfilePlan, period_s: float) -> np.ndarray:
     ramps = _place(plan, units, _solve_speed(plan, units))
     _check_ramps(plan, ramps, units)
 
-    rows = np.zeros(ticks + 2, np.int64)  # jerk by tick; the last two must stay 0
+    rows = np.zeros(ticks, np.int64)  # jerk by tick
     for ramp in ramps:
         if ramp.pulses:
             _add(rows, ramp.pulses)
         else:
             rows[round(ramp.start) : round(ramp.end)] += _sinusoid(ramp, units)
-    if rows[ticks:].any():
-        raise PlanError(f"ramp {len(ramps)} ends after duration_s = {plan.duration_s:g}")
 
-    segments = _segments(rows[:ticks])
+    segments = _segments(rows)
     _check_profile(plan, evaluate(segments, period_s), units)
     return segments
 
@@ -207,10 +209,10 @@ def _place(plan: ProfilePlan, units: Units, solved_m_s: float) -> list[PlacedRam
         start = _snap(start)
         if ramp.sinusoidal_s is not None:
             start = float(math.ceil(start))
-        end = start + duration
+        end = _snap(start + duration)
         centre, pulses = (start + end) / 2, tuple[Pulse, ...]()
         if ramp.sinusoidal_s is None and change != 0:
-            pulses = _place_pulses(change, start, rise, duration)
+            pulses = _place_pulses(change, start, end, rise, ramp.end_s is not None)
             centre = _centre(pulses, change)
         placed.append(PlacedRamp(number, change, start, end, centre, pulses))
     return placed
@@ -243,7 +245,7 @@ def _durations(ramp: Ramp, number: int, change_m_s: float, units: Units) -> tupl
 
 def _snap(ticks: float) -> float:
     """A time without rounding noise: what falls on a tick on paper does so here."""
-    return round(ticks, 6)
+    return round(ticks, 8)
 
 
 def _ramp_ticks(time_s: float, number: int, key: str, units: Units) -> int:
@@ -260,35 +262,50 @@ def _whole_ticks(time_s: float, name: str, units: Units) -> int:
 # Laying a ramp onto whole ticks.
 
 
-def _place_pulses(change: int, start: float, rise: float, duration: float) -> tuple[Pulse, Pulse]:
+def _place_pulses(
+    change: int, start: float, end: float, rise: float, keeps_end: bool
+) -> tuple[Pulse, Pulse]:
+    """The pulses of a ramp, centred between its times but not outside their ticks.
+
+    On whole ticks the pulses can be a little longer than on paper. If they then need a tick more,
+    the ramp keeps its start, or if `keeps_end` its end.
+    """
+    size = abs(change)
     # Rounded up, so that the pulses never need more room than on paper.
-    peak = math.ceil(abs(change) / (duration - rise))
+    peak = math.ceil(size / (end - start - rise))
     slope = min(math.ceil(peak / rise), peak)
     earliest = peak * math.floor(start) + _box_moment(peak, slope)
-    return _lay_pulses(change, peak, slope, start + duration / 2, earliest)
+    latest = peak * (math.ceil(end) - 1) - _box_moment(peak, slope) - size
+    moment = round(peak * ((start + end) / 2 - 0.5) - size / 2)
+    if keeps_end:
+        moment = min(max(moment, earliest), latest)
+    else:
+        moment = max(min(moment, latest), earliest)
+    return _lay_pulses(change, peak, slope, moment)
 
 
-def _lay_pulses(
-    change: int, peak: int, slope: int, centre: float, earliest: int
-) -> tuple[Pulse, Pulse]:
-    """A box of area `peak` and height `slope`, and its opposite, around `centre`.
+def _lay_pulses(change: int, peak: int, slope: int, moment: int) -> tuple[Pulse, Pulse]:
+    """A box of area `peak` and height `slope` and its opposite, which change the speed exactly.
 
-    The difference of their moments, each the sum of tick times jerk, is the change of speed: exact.
+    The change is the difference of their moments, each the sum of tick times jerk; `moment`, about
+    met, is that of the first.
     """
-    direction, size = (1, change) if change > 0 else (-1, -change)
-    moment = max(round(peak * (centre - 0.5) - size / 2), earliest)
+    direction = 1 if change > 0 else -1
     begin, rising, lack = _lay_box(peak, slope, moment)
-    turn, falling, lack = _lay_box(peak, slope, moment - lack + size)
+    turn, falling, lack = _lay_box(peak, slope, moment - lack + abs(change))
     falling[-1 - lack] -= 1
     falling[-1] += 1
-    return Pulse(begin, direction * rising), Pulse(turn, -direction * falling)
+    return (
+        Pulse(begin, direction * np.trim_zeros(rising, "b")),
+        Pulse(turn, -direction * np.trim_zeros(falling, "b")),
+    )
 
 
 def _lay_box(area: int, slope: int, moment: int) -> tuple[int, NDArray[np.int64], int]:
-    """Lay a box of height `slope` (at most `area`) onto ticks: its first tick, its rows, its lack.
+    """Lay a box of height `slope`, at most `area`, onto ticks: first tick, rows, missing moment.
 
-    The box begins and ends inside a tick, so its first and last rows are parts of `slope`. Its
-    moment lacks less than the number of its rows, which one unit moved by that many rows supplies.
+    The box begins and ends inside a tick: its first and last rows are parts of `slope`. What its
+    moment then misses is less than its rows; one unit, moved by so many rows to the last, adds it.
     """
     full, rest = divmod(area, slope)
     first, excess = divmod(moment - _box_moment(area, slope), area)
@@ -313,17 +330,17 @@ def _box_moment(area: int, slope: int) -> int:
 
 def _centre(pulses: tuple[Pulse, ...], change: int) -> float:
     """Tick at which a step of speed would give the length that the pulses give."""
-    second_moment = sum(
-        jerk * tick * tick
-        for pulse in pulses
-        for tick, jerk in enumerate(pulse.rows.tolist(), pulse.first)
-    )
-    return 0.5 - second_moment / (2 * change)
+    start = pulses[0].first
+    second_moment = 0  # from the ramp's own start it fits 64 bits at any speed of the firmware
+    for pulse in pulses:
+        ticks = np.arange(len(pulse.rows)) + (pulse.first - start)
+        second_moment += int((pulse.rows * ticks * ticks).sum())
+    return start + 0.5 - second_moment / (2 * change)
 
 
 def _add(rows: NDArray[np.int64], pulses: tuple[Pulse, ...]) -> None:
     for pulse in pulses:
-        rows[pulse.first : pulse.first + len(pulse.rows)] += pulse.rows
+        rows[pulse.first : pulse.end] += pulse.rows
 
 
 def _sinusoid(ramp: PlacedRamp, units: Units) -> NDArray[np.int64]:
@@ -372,7 +389,8 @@ def _sinusoid_rows(size: int, ticks: int, count: int) -> NDArray[np.int64]:
     missing = size - int(np.cumsum(rows).sum())
     if missing:
         peak = math.ceil(abs(missing) / half)
-        _add(rows, _lay_pulses(missing, peak, peak, ticks / 2, 0))
+        moment = (peak * (ticks - 1) - abs(missing)) // 2  # centred
+        _add(rows, _lay_pulses(missing, peak, peak, moment))
     return rows
 
 
@@ -414,6 +432,7 @@ def _segments(rows: NDArray[np.int64]) -> np.ndarray:
 
 def _check_ramps(plan: ProfilePlan, ramps: list[PlacedRamp], units: Units) -> None:
     """Order, levels and speeds of the placed ramps."""
+    ticks = round(plan.duration_s / units.period_s)
     end_s, speed_m_s = 0.0, 0.0
     for ramp, placed in zip(plan.ramps, ramps, strict=True):
         name = f"ramp {placed.number}"
@@ -434,8 +453,10 @@ def _check_ramps(plan: ProfilePlan, ramps: list[PlacedRamp], units: Units) -> No
         _check_limit(name, "max_speed_m_s", speed_m_s, plan.max_speed_m_s)
         _check_limit(name, "max_acceleration_m_s2", acceleration, plan.max_acceleration_m_s2)
         _check_limit(name, "max_jerk_m_s3", jerk, plan.max_jerk_m_s3)
-    if end_s > plan.duration_s + units.period_s * 1e-6:
-        raise PlanError(f"the last ramp ends at {end_s:.3f} s, duration_s = {plan.duration_s:g}")
+        if end_s > plan.duration_s + units.period_s * 1e-6:
+            raise PlanError(f"{name} ends at {end_s:.3f} s, after duration_s = {plan.duration_s:g}")
+        if any(pulse.first < 0 or pulse.end > ticks for pulse in placed.pulses):
+            raise PlanError(f"{name} does not fit the run in whole ticks: it needs one more")
     if sum(placed.change for placed in ramps) != 0:
         raise PlanError(f"the plan ends at {speed_m_s:.4f} m/s, expected standstill")
 
@@ -457,8 +478,9 @@ def _check_limit(name: str, key: str, value: float, limit: float) -> None:
 def _check_profile(plan: ProfilePlan, profile: Profile, units: Units) -> None:
     """Length and limits over time of the finished table."""
     length_m = float(profile.position_m[-1])
-    if plan.distance_m and abs(length_m - plan.distance_m) > DISTANCE_TOLERANCE_M:
-        raise PlanError(f"the plan is {length_m:.4f} m long, distance_m = {plan.distance_m:.4f}")
+    wanted_m = length_m if plan.distance_m is None else plan.distance_m
+    if abs(length_m - wanted_m) > DISTANCE_TOLERANCE_M:
+        raise PlanError(f"the plan is {length_m:.4f} m long, distance_m = {wanted_m:.4f}")
     if plan.limits:
         ticks = np.arange(len(profile.speed_m_s))
         limit = limit_at(plan.limits, ticks, units.period_s)

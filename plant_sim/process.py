@@ -24,7 +24,7 @@ from plant_sim.scenario import ScenarioError, load
 
 FRAME_IDS = [message.frame_id for message in MESSAGES]
 TICK_START = FORCE_CMD.Tick.start
-REPEAT_S = 0.02  # RUN_CTRL outside a run
+REPEAT_S = 0.1  # RUN_CTRL outside a run
 PROGRESS_S = 0.1
 
 
@@ -38,19 +38,22 @@ class Stopped(Exception):
 
 def post(here: world.World, bus: can.BusABC) -> None:
     """Sends the fresh mailboxes and empties them."""
-    frames = [(FRAME_IDS[i], word) for i, (word, fresh, _) in enumerate(here.tx.tolist()) if fresh]
-    here.tx["fresh"][:] = 0
+    fresh = here.tx["fresh"]
+    words = here.tx["payload"].tolist()
+    frames = [(FRAME_IDS[i], words[i]) for i in fresh.nonzero()[0].tolist()]
+    fresh.fill(0)
     send_frames(bus, frames)
 
 
 def collect(here: world.World, bus: can.BusABC, timeout_s: float) -> list[int]:
     """Received frames into the mailboxes; the identifiers of those that the plant knows."""
     known = []
+    payloads, fresh = here.rx["payload"], here.rx["fresh"]
     for frame_id, payload in recv_frames(bus, timeout_s):
         index = INDEX_OF_FRAME_ID.get(frame_id)
         if index is not None:
-            here.rx["payload"][index] = payload
-            here.rx["fresh"][index] = 1
+            payloads[index] = payload
+            fresh[index] = 1
             known.append(frame_id)
     return known
 
@@ -59,21 +62,26 @@ def agree(
     here: world.World, bus: can.BusABC, run_state: int, run: int, timeout_s: float, stop: Stop
 ) -> int:
     """Repeats RUN_CTRL until the controller confirms; returns its fault bits. Raises SilentNode."""
-    node = here.state["node"]
+    node = here.state[0]["node"]
     deadline = time.monotonic() + timeout_s
+    sent = answered = 0
+    faults = None
     while time.monotonic() < deadline:
         if stop.requested:
             raise Stopped
-        plant.announce(node, run_state, run, here.tx)
-        post(here, bus)
+        if faults is None:
+            plant.announce(node, run_state, run, here.tx)
+            post(here, bus)
+            sent += 1
         until = time.monotonic() + REPEAT_S
         while time.monotonic() < until:
-            if ATO_STATUS.frame_id not in collect(here, bus, REPEAT_S):
-                continue
-            word = int(here.rx["payload"][ATO_STATUS.index])
+            answered += collect(here, bus, REPEAT_S).count(ATO_STATUS.frame_id)
             if plant.confirmed(node, here.rx):
-                here.rx["fresh"][:] = 0
-                return int(get(word, ATO_STATUS.Faults))
+                faults = int(get(int(here.rx["payload"][ATO_STATUS.index]), ATO_STATUS.Faults))
+            here.rx["fresh"][:] = 0
+            # Every announcement is answered: none of the answers may fall into the run that follows.
+            if faults is not None and answered >= sent:
+                return faults
     what = "armed" if run_state == plant.ARMED else "ended"
     raise SilentNode(
         f"controller is silent: no ATO_STATUS({what}) for run {run} within {timeout_s:g} s"
@@ -90,7 +98,7 @@ def drive(
     payload = here.rx["payload"]
     next_progress = time.monotonic()
     for tick in range(here.loaded.ticks):
-        here.sense(here.params, here.limits, here.state, chance[tick], here.tx)
+        here.sense(here.params, here.limits, here.state, chance, tick, here.tx)
         post(here, bus)
         deadline = 0.0
         while True:
@@ -108,9 +116,9 @@ def drive(
                     f" within {timeout_s:g} s"
                 )
         here.actuate_and_advance(
-            here.params, here.track, here.state, chance[tick], here.rx, truth[tick]
+            here.params, here.track, here.state, chance, tick, here.rx, truth
         )
-        rx_fresh[:] = 0
+        rx_fresh.fill(0)
         if stop.requested:
             raise Stopped
         if tick & 63 == 0 and time.monotonic() >= next_progress:
@@ -129,7 +137,7 @@ def one_run(
     try:
         drive(here, bus, run, truth, timeout_s, stop)
     except (SilentNode, Stopped):
-        done = int(here.state["node"]["tick"])
+        done = int(here.state[0]["node"]["tick"])
         np.save(file, truth[:done])
         tell("cut", run=run, ticks=done, file=str(file))
         raise
@@ -143,7 +151,7 @@ def one_run(
         seconds=seconds,
         file=str(file),
         faults=faults,
-        refused=int(here.state["node"]["refused"]),
+        refused=int(here.state[0]["node"]["refused"]),
     )
 
 
@@ -153,7 +161,8 @@ def main() -> int:
     parser.add_argument("--scenario", required=True)
     parser.add_argument("--bus", required=True)
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--runs", type=int, required=True)
+    parser.add_argument("--first-run", type=int, default=1)
+    parser.add_argument("--last-run", type=int, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--timeout", type=float, default=1.0, help="silence that ends a run, s")
     arguments = parser.parse_args()
@@ -171,7 +180,7 @@ def main() -> int:
     try:
         while commands.empty() and not stop.requested:
             time.sleep(0.005)
-        for run in range(1, arguments.runs + 1):
+        for run in range(arguments.first_run, arguments.last_run + 1):
             one_run(here, bus, run, arguments.out, arguments.timeout, stop)
     except Stopped:
         return 0
@@ -192,10 +201,10 @@ def warm_up(here: world.World) -> None:
     truth = np.zeros(1, plant.TRUTH)
     chance = np.zeros(1, plant.CHANCE)
     here.begin(here.params, here.state)
-    here.sense(here.params, here.limits, here.state, chance[0], here.tx)
-    here.actuate_and_advance(here.params, here.track, here.state, chance[0], here.rx, truth[0])
-    plant.announce(here.state["node"], plant.IDLE, 0, here.tx)
-    plant.confirmed(here.state["node"], here.rx)
+    here.sense(here.params, here.limits, here.state, chance, 0, here.tx)
+    here.actuate_and_advance(here.params, here.track, here.state, chance, 0, here.rx, truth)
+    plant.announce(here.state[0]["node"], plant.IDLE, 0, here.tx)
+    plant.confirmed(here.state[0]["node"], here.rx)
     here.tx["fresh"][:] = 0
 
 

@@ -59,7 +59,7 @@ COLUMNS = (
 class Screen:
     """Progress bar and table of a session; a plain line a run where there is no terminal."""
 
-    def __init__(self, runs: int, ticks: int) -> None:
+    def __init__(self, runs: range, ticks: int) -> None:
         self.runs, self.ticks = runs, ticks
         self.rows: list[dict[str, Any]] = []
         self.faults = 0
@@ -72,7 +72,7 @@ class Screen:
             transient=True,
             disable=not console.is_terminal,
         )
-        self.task = self.bar.add_task("run", total=runs * ticks, run=1, runs=runs, rate="-", last="")
+        self.task = self.bar.add_task("run", total=len(runs) * ticks, run=runs[0], runs=runs[-1], rate="-", last="")
 
     def note(self, text: str) -> None:
         """One line above the bar."""
@@ -80,7 +80,7 @@ class Screen:
 
     def progress(self, run: int, tick: int) -> None:
         """Moves the bar."""
-        done = (run - 1) * self.ticks + tick
+        done = (run - self.runs[0]) * self.ticks + tick
         speed = self.bar.tasks[0].speed
         rate = f"{speed:,.0f}" if speed else "-"
         self.bar.update(self.task, completed=done, run=run, rate=rate)
@@ -90,7 +90,7 @@ class Screen:
         self.rows.append(row)
         self.faults += len(row["faults"])
         last = f"last: {row['max_position_error_m'] * 1e3:.2f} mm, {self.faults} faults"
-        self.bar.update(self.task, completed=row["run"] * self.ticks, last=last)
+        self.bar.update(self.task, completed=(row["run"] - self.runs[0] + 1) * self.ticks, last=last)
         if not console.is_terminal:
             cells = [f"{name.split(chr(10))[0]} {_cell(row, key, f, s)}" for name, key, f, s in COLUMNS]
             console.print("  ".join(cells + [_faults(row)]).rstrip(), soft_wrap=True)
@@ -162,16 +162,19 @@ def _run(
     memory: Path | None,
     trace: bool,
 ) -> None:
+    from controller.registry import load_law
     from plant_sim.scenario import load
     from tools import session
     from tools.hil import RunError
+    from tools.setup import run_numbers
 
     loaded = load(scenario)
     law = law or loaded.scenario.law
     count = runs or loaded.scenario.runs
+    load_law(law)
     folder = out or Path("runs") / f"{loaded.name}-{law}-{mode.value}"
     options = session.Options(scenario, law, count, mode.value, bus, seed, folder, memory, trace)
-    screen = Screen(count, loaded.ticks)
+    screen = Screen(run_numbers(law, count), loaded.ticks)
     console.print(f"{loaded.scenario.title}: law {law}, {count} runs of {loaded.ticks} ticks, {mode.value}")
     try:
         with screen.bar:

@@ -161,7 +161,7 @@ def run(
     scenario: str,
     calibration: Calibration,
     bus: str,
-    runs: int,
+    runs: range,
     seed: int,
     out: Path,
     memory_file: Path | None,
@@ -185,13 +185,14 @@ def run(
                 *("--scenario", scenario),
                 *("--bus", bus),
                 *("--seed", str(seed)),
-                *("--runs", str(runs)),
+                *("--first-run", str(runs[0])),
+                *("--last-run", str(runs[-1])),
                 *("--out", scratch),
             ],
         )
         bench.wait_ready()
         plant.command(command="start")
-        while "done" not in plant.said or recorder.said.get("run", {}).get("run") != runs:
+        while "done" not in plant.said or recorder.said.get("run", {}).get("run") != runs[-1]:
             got = bench.next_event(0.5)
             if got is not None:
                 yield (*got, bench)

@@ -24,6 +24,7 @@ from plant_sim.scenario import Loaded, load
 from tools import hil, metrics, setup, sil
 from tools.frames import Digest
 from tools.hil import RunError
+from tools.recorder import save_settings
 
 SCHEMA = 1
 RUNS_MAX = 4095  # Iteration has 12 bits
@@ -68,7 +69,7 @@ class Session:
     options: Options
     loaded: Loaded
     law: str
-    runs: int
+    runs: range
     listener: Listener
     summary: dict[str, Any] = field(default_factory=dict)
 
@@ -87,7 +88,7 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         raise SessionError(f"{runs} runs, expected 1 to {RUNS_MAX}")
     calibration = setup.calibration_for(loaded, law)
     _prepare(options.out)
-    session = Session(options, loaded, law, runs, listener)
+    session = Session(options, loaded, law, setup.run_numbers(law, runs), listener)
     session.summary = {
         "schema": SCHEMA,
         "scenario": loaded.name,
@@ -178,11 +179,14 @@ def _run_in_process(session: Session, calibration: Any) -> None:
             writer.close()
 
 
-def trace_settings(loaded: Loaded, law: str) -> dict[str, Any]:
+def _trace_settings(session: Session) -> dict[str, Any]:
     """What a trace needs to know, as TraceWriter takes it."""
+    loaded, law = session.loaded, session.law
     module = load_law(law)
     return {
-        "title": f"{loaded.name} {law}",
+        "title": f"{loaded.name}, {law}, {session.options.mode}",
+        "first_run": session.runs[0],
+        "last_run": session.runs[-1],
         "period_s": loaded.scenario.period_s,
         "estimates": [f"{name} [{unit}]" for name, unit, _q in module.ESTIMATES],
         "cars": len(loaded.scenario.train.effectiveness) if loaded.scenario.control.distribute else 0,
@@ -195,8 +199,17 @@ def _trace_writer(session: Session) -> Any:
     return TraceWriter(
         session.options.out / "trace.rrd",
         reference=session.loaded.profile,
-        **trace_settings(session.loaded, session.law),
+        **_trace_settings(session),
     )
+
+
+def _recorder_arguments(session: Session, kept: Path) -> list[str]:
+    arguments = ["--out", str(session.options.out), "--keep-frames", str(kept)]
+    if session.options.trace:
+        settings = kept / "trace.npz"
+        save_settings(settings, session.loaded.profile, **_trace_settings(session))
+        arguments += ["--trace", str(settings)]
+    return arguments
 
 
 def _run_hil(session: Session, calibration: Any) -> None:

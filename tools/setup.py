@@ -8,6 +8,7 @@ import msgspec
 
 from controller.calibration import Calibration, GuardSettings, MemorySettings, calibrate
 from controller.quantise import CalibrationError, Vehicle
+from controller.registry import load_law
 from plant_sim.scenario import Loaded, ScenarioError
 
 
@@ -42,6 +43,11 @@ def _settings(key: str, values: dict[str, Any], kind: Any) -> Any:
         return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
         raise CalibrationError(f"{key}: {error}") from None
+
+
+def run_numbers(law: str, runs: int) -> range:
+    """Numbers of `runs` runs: from 1, after an initial run 0 for laws that learn from one (INITIAL_RUN in their file)."""
+    return range(0 if getattr(load_law(law), "INITIAL_RUN", False) else 1, runs + 1)
 
 
 def error_weight(loaded: Loaded, law: str) -> float | None:

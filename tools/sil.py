@@ -78,13 +78,13 @@ def build_loop(controller_tick: Any, sense: Any, actuate_and_advance: Any) -> An
         count = int64(0)
         for tick in range(ticks):
             clear(to_controller)
-            sense(plant_params, limits, plant_state, chance[tick], to_controller)
+            sense(plant_params[0], limits, plant_state[0], chance[tick], to_controller)
             count = log_mailboxes(to_controller, tick, frames, count)
             clear(to_plant)
-            controller_tick(params, profile, state, cells, to_controller, to_plant)
+            controller_tick(params[0], profile, state[0], cells, to_controller, to_plant, 1)
             count = log_mailboxes(to_plant, tick, frames, count)
             actuate_and_advance(
-                plant_params, track, plant_state, chance[tick], to_plant, truth[tick]
+                plant_params[0], track, plant_state[0], chance[tick], to_plant, truth[tick]
             )
         return count
 
@@ -95,18 +95,18 @@ def run(
     loaded: Loaded,
     calibration: Calibration,
     *,
-    runs: int,
+    runs: range,
     seed: int,
     memory_file: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[tuple[RunResult, controller_node.Controller]]:
-    """The runs 1 to `runs`, one after the other; `progress(run, tick)` is called as they go."""
+    """The runs numbered `runs`, one after the other; `progress(run, tick)` is called as they go."""
     node = controller_node.build(calibration, memory_file)
     here = world.build(loaded, seed)
     here.tx, here.rx = node.rx, node.tx  # the mailboxes are the bus
-    loop = build_loop(node.tick, here.sense, here.actuate_and_advance)
+    _begin, sense, actuate_and_advance = here.steps
+    loop = build_loop(node.tick, sense, actuate_and_advance)
     frames = world.rows(np.zeros(loaded.ticks * MESSAGE_COUNT, FRAME))
-    profile = world.rows(calibration.profile)
     chance = world.rows(np.zeros(loaded.ticks, plant.CHANCE))
     truth = world.rows(np.zeros(loaded.ticks, plant.TRUTH))
 
@@ -121,7 +121,7 @@ def run(
                 chance,
                 truth,
                 node.params,
-                profile,
+                node.profile,
                 node.state,
                 node.cells,
                 node.rx,
@@ -131,7 +131,7 @@ def run(
         )
 
     drive(0, chance, truth)  # compiles, or loads what was compiled before
-    for number in range(1, runs + 1):
+    for number in runs:
         if progress:
             progress(number, 0)
         _announce(here, node, plant.ARMED, number)
@@ -141,7 +141,7 @@ def run(
         started = time.perf_counter()
         count = drive(loaded.ticks, chance, world.rows(truth))
         seconds = time.perf_counter() - started
-        faults = fault_names(int(node.state["core"]["faults"]))
+        faults = fault_names(int(node.state[0]["core"]["faults"]))
         _announce(here, node, plant.ENDED, number)
         if progress:
             progress(number, loaded.ticks)
@@ -152,8 +152,8 @@ def _announce(here: world.World, node: controller_node.Controller, run_state: in
     """RUN_CTRL outside a run, and the controller's answer."""
     clear(node.rx)
     clear(node.tx)
-    plant.announce(here.state["node"], run_state, run, node.rx)
-    controller_node.cycle(node)
+    plant.announce(here.state[0]["node"], run_state, run, node.rx)
+    controller_node.cycle(node, 0)
 
 
 def commanded_force_n(frames: np.ndarray, ticks: int) -> np.ndarray:

@@ -18,7 +18,7 @@ Runs share the first two, so that a view that takes a plot of several runs overl
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -220,6 +220,10 @@ _UNITS = (
 )
 
 
+class TraceError(ValueError):
+    """The trace cannot be written; one line that names the file and says why."""
+
+
 class Reference(Protocol):
     """What the train should do: float64 columns, one value a tick."""
 
@@ -240,29 +244,33 @@ class TraceWriter:
         *,
         title: str,
         period_s: float,
-        runs: int,
         cars: int,
         reference: Reference,
         estimates: Sequence[str] = (),
+        first_run: int = 1,
+        last_run: int = 10,
     ) -> None:
         """Create the file and log the reference.
 
         :param path: the .rrd file.
         :param title: name of the recording: scenario, law, mode.
         :param period_s: control period.
-        :param runs: how many runs are expected (for their names and colours; more may come).
         :param cars: how many cars have a force of their own, 0 to 8.
         :param estimates: names, with unit, of the law's estimates 0, 1, …
-        :raises ValueError: `cars` is out of range.
+        :param first_run: number of the first run that is expected, for the colours of the runs.
+        :param last_run: number of the last one; more may come.
+        :raises TraceError: the file cannot be written, or `cars` is out of range.
         """
         import rerun as rr  # costs a second and 100 MB: only who writes a trace pays for it
 
         if not 0 <= cars <= MAX_CARS:
-            raise ValueError(f"{path}: cars = {cars}: expected 0 to {MAX_CARS}")
+            raise TraceError(f"{path}: cars = {cars}: expected 0 to {MAX_CARS}")
         self._rr = rr
+        self._path = path
         self._period_ns = round(period_s * 1e9)
-        self._runs = runs
+        self._first_run, self._last_run = first_run, last_run
         self._reference = reference
+        self._cars = cars
         self._estimates = tuple(estimates)
         self._plots = (*PLOTS, _car_force_plot(cars)) if cars else PLOTS
         self._state_names = {lane.name: _state_names(lane) for lane in LANES}
@@ -271,7 +279,8 @@ class TraceWriter:
         self._styled: set[str] = set()  # entities whose static style is logged
         self._summary: list[dict[str, Any]] = []
 
-        identity = (str(path.resolve()), title, self._period_ns, runs, cars, self._estimates)
+        # Equal for equal arguments, but for no two files: a viewer merges recordings of one name.
+        identity = (str(path.resolve()), title, period_s, cars, estimates, first_run, last_run)
         self._stream = rr.RecordingStream(
             "ato-hil",
             recording_id=hashlib.blake2b(repr(identity).encode(), digest_size=16).hexdigest(),
@@ -279,7 +288,10 @@ class TraceWriter:
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
         sinks = [rr.FileSink(path)]  # a live viewer is one more
-        self._stream.set_sinks(*sinks)
+        try:
+            self._stream.set_sinks(*sinks)
+        except RuntimeError as error:
+            raise TraceError(f"{path}: cannot write the trace: {error}") from None
         self._stream.send_recording_name(title)
         for field in ("position_m", "speed_m_s", "acceleration_m_s2"):
             values = getattr(reference, field)[:, None]
@@ -287,13 +299,16 @@ class TraceWriter:
             self._log_scalars(f"reference/{field}", index, values, ["reference"], [ORANGE])
 
     def frames(self, run: int, frames: np.ndarray) -> None:
-        """Log FRAME rows of whole ticks; the batches of a run follow one another."""
+        """Log FRAME rows of whole ticks; the batches of a run follow one another.
+
+        Batches of 100 ticks and more are cheap: a batch costs some milliseconds by itself.
+        """
         found = {message.name: columns(frames, message) for message in MESSAGES}
         if run != self._run:
             self._run = run
             self._states.clear()
             neighbours = len(found[NEIGHBOUR_AHEAD_POSITION.name][0]) > 0
-            layout = _blueprint(self._run_name(run), self._estimates, neighbours)
+            layout = _blueprint(self._run_name(run), self._cars > 0, self._estimates, neighbours)
             self._stream.send_blueprint(layout)
         for plot in self._plots:
             ticks, values = _table(plot, found)
@@ -352,22 +367,29 @@ class TraceWriter:
 
     def text(self, run: int, tick: int, message: str, level: str = "INFO") -> None:
         """Log an event; `level` is one of Rerun's: INFO, WARN, ERROR, CRITICAL."""
-        columns = self._rr.TextLog.columns(text=[message], level=[level])
-        self._send("events", self._index(np.array([tick]), run), columns)
+        content = self._rr.TextLog.columns(text=[message], level=[level])
+        self._send("events", self._index(np.array([tick]), run), content)
 
     def close(self) -> None:
-        """Write everything out, with the footer that makes the file complete."""
-        self._stream.flush()
-        self._stream.disconnect()
+        """Write everything out, with the footer that makes the file complete.
+
+        :raises TraceError: the disk is full, or the like.
+        """
+        try:
+            self._stream.flush()
+        except RuntimeError as error:
+            raise TraceError(f"{self._path}: the trace is incomplete: {error}") from None
+        finally:
+            self._stream.disconnect()
 
     def _entity(self, name: str, run: int) -> str:
         return f"{name}/{self._run_name(run)}"
 
     def _run_name(self, run: int) -> str:
-        return f"run_{run:0{max(2, len(str(self._runs)))}}"
+        return f"run_{run:0{max(2, len(str(self._last_run)))}}"
 
     def _colour(self, run: int) -> Colour:
-        return _ramp((run - 1) / max(self._runs - 1, 1))
+        return _ramp((run - self._first_run) / max(self._last_run - self._first_run, 1))
 
     def _index(self, ticks: np.ndarray, run: int | None = None) -> list[rr.TimeColumn]:
         """Columns of the timelines for rows at these ticks."""
@@ -415,7 +437,9 @@ class TraceWriter:
             colours = [STATE_COLOURS.get(name, GREY) for name in names.values()]
             style = self._rr.StateConfiguration(values=[*names.values()], colors=colours)
             self._stream.log(entity, style, static=True, strict=True)
-        states = [names.get(value) or _fault_text(value) for value in values[changes].tolist()]
+        states = [
+            names.get(value) or _state_text(lane, value) for value in values[changes].tolist()
+        ]
         index = self._index(ticks[changes], run)
         self._send(entity, index, self._rr.StateChange.columns(state=states))
 
@@ -425,12 +449,12 @@ class TraceWriter:
 
         ticks, counts = np.unique(frames["tick"], return_counts=True)
         components = {name: pa.array(frames[name]) for name in ("frame_id", "payload")}
-        columns = self._rr.DynamicArchetype.columns("ato_hil.Frames", components=components)
-        columns = columns.partition(counts)
-        self._send(self._entity("bus/frames", run), self._index(ticks, run), columns)
+        content = self._rr.DynamicArchetype.columns("ato_hil.Frames", components=components)
+        entity = self._entity("bus/frames", run)
+        self._send(entity, self._index(ticks, run), content.partition(counts))
 
-    def _send(self, entity: str, index: list[rr.TimeColumn], columns: Any) -> None:
-        self._stream.send_columns(entity, index, columns, strict=True)
+    def _send(self, entity: str, index: list[rr.TimeColumn], content: Any) -> None:
+        self._stream.send_columns(entity, index, content, strict=True)
 
 
 def _car_force_plot(cars: int) -> Plot:
@@ -468,8 +492,10 @@ def _state_names(lane: Lane) -> dict[int, str]:
     return {0: "no", 1: "yes"} if signal.length == 1 else {0: "none"}
 
 
-def _fault_text(bits: int) -> str:
-    return ", ".join(fault_names(bits)) or f"{bits:#x}"
+def _state_text(lane: Lane, value: int) -> str:
+    """Text for a value that has no name: a set of faults, or nothing that the DBC knows."""
+    known = ", ".join(fault_names(value)) if lane.signal == "Faults" else ""
+    return known or f"{value:#x}"
 
 
 def _ramp(fraction: float) -> Colour:
@@ -504,7 +530,9 @@ def _markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _blueprint(current: str, estimates: Sequence[str], neighbours: bool) -> rrb.Blueprint:
+def _blueprint(
+    current: str, car_forces: bool, estimates: Sequence[str], neighbours: bool
+) -> rrb.Blueprint:
     """The views; `current` is the run in those that show one run."""
     import rerun as rr
     import rerun.blueprint as rrb
@@ -533,6 +561,12 @@ def _blueprint(current: str, estimates: Sequence[str], neighbours: bool) -> rrb.
             plot_legend=rrb.PlotLegend(visible=False),
         )
 
+    def beside(views: Iterable[rrb.TimeSeriesView]) -> list[rrb.Container]:
+        found = list(views)
+        if not found:
+            return []
+        return [rrb.Horizontal(*found) if len(found) <= 3 else rrb.Tabs(*found)]
+
     overview = rrb.Horizontal(
         rrb.Vertical(
             plot(
@@ -541,7 +575,9 @@ def _blueprint(current: str, estimates: Sequence[str], neighbours: bool) -> rrb.
                 "reference/speed_m_s",
                 legend=False,
             ),
-            plot("Force by car [N]", f"bus/car_force/{current}"),
+            plot("Force by car [N]", f"bus/car_force/{current}")
+            if car_forces
+            else plot("Force [N]", f"bus/force/{current}", legend=False),
             rrb.StateTimelineView(
                 name="States and faults",
                 origin=f"/bus/state/{current}",
@@ -553,17 +589,9 @@ def _blueprint(current: str, estimates: Sequence[str], neighbours: bool) -> rrb.
         rrb.Vertical(
             by_run("Position error, first run violet, last yellow [m]", "truth/position_error_m"),
             by_run("Speed error, first run violet, last yellow [m/s]", "truth/speed_error_m_s"),
-            *(
-                [
-                    rrb.Horizontal(
-                        *(
-                            by_run(f"Estimate {name}", f"bus/estimate_{number}")
-                            for number, name in enumerate(estimates)
-                        )
-                    )
-                ]
-                if estimates
-                else []
+            *beside(
+                by_run(f"Estimate {name}", f"bus/estimate_{number}")
+                for number, name in enumerate(estimates)
             ),
             rrb.Horizontal(bars("max_position_error_m"), bars("max_speed_error_m_s")),
         ),

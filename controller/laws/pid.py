@@ -69,6 +69,9 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
 @step
 def pid(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
     """One tick of the PID baseline."""
+    if int64(inputs.tick) == 0:
+        state.integral = 0
+        state.last = 0
     eps = sat32(int64(inputs.reference_speed) - int64(inputs.speed))
     integral = clamp(int64(state.integral) + eps, -int64(INTEGRAL_MAX), int64(INTEGRAL_MAX))
     change = eps - int64(state.last)

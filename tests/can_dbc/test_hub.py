@@ -332,20 +332,20 @@ def test_nodes_that_start_at_once_find_each_other(runtime_dir):
     assert all(heard == set(range(count)) for _, heard in results)
 
 
-def test_two_threads_send_and_one_receives(node):
-    both, peer = node(), node()
+def test_what_threads_send_at_once_is_not_mixed(node):
+    both, peer = node(fd=True), node(fd=True)
+    count = 10_000  # more than a socket takes at a time
 
     def send_all(can_id: int) -> None:
-        for count in range(500):
-            both.send_frames([(can_id, count), (can_id + 8, count)])
+        both.send_frames([(can_id, payload) for payload in range(count)])
 
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(send_all, (1, 2)))
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(send_all, range(3)))
     arrived: list[tuple[int, int]] = []
-    while len(arrived) < 2000:
+    while len(arrived) < 3 * count:
         arrived += peer.recv_frames(TIMEOUT_S)
-    for can_id in (1, 2, 9, 10):
-        assert [payload for each, payload in arrived if each == can_id] == list(range(500))
+    for can_id in range(3):
+        assert [payload for each, payload in arrived if each == can_id] == list(range(count))
 
 
 def test_an_asyncio_notifier_misses_nothing(node):

@@ -1,0 +1,281 @@
+"""The tap: a third node that only listens, and keeps every frame of every run.
+
+A run lasts from RUN_CTRL(running) to RUN_CTRL of any other state or iteration; FORCE_CMD closes a
+tick. Frames between runs are not recorded. Received frames go into one growing array for each run
+and are decoded by whole columns, a thousand ticks at a time, so that a run that is cut short
+leaves its trace. Internal: `ato-hil run` starts it.
+
+It says on stdout, in JSON lines:
+
+    {"event": "ready"}                                     it listens
+    {"event": "run", "run": 1, "ticks": …, "frames": …,    a run has ended; lost frames by message,
+     "lost": {…}, "digest": "…", "complete": true}         digest of all runs so far
+    {"event": "error", "message": "…"}                     it ends early
+
+and takes on stdin:
+
+    {"command": "truth", "run": 1, "file": "truth.npy"}    true state of the plant, for the trace
+    {"command": "summary", "run": 1, "row": {…}}           the run's row of summary.json, likewise
+    {"command": "stop"}                                    as SIGTERM, SIGINT and the end of stdin
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import queue
+import signal
+import sys
+import time
+from itertools import chain
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import can
+import numpy as np
+
+from can_dbc import e2e
+from can_dbc.bus import FOREIGN, open_bus, recv_frames
+from can_dbc.child import Stop, follow_parent, tell
+from can_dbc.codec import FORCE_CMD, MESSAGES, RUN_CTRL, choices, decode_column
+from tools.frames import FRAME, Digest, columns
+from tools.trace import Reference, TraceWriter
+
+BATCH_TICKS = 1000  # of the trace
+# Frames gather while the recorder sleeps: it wakes 500 times a second instead of once a frame, and
+# leaves the two cores to plant and controller.
+PAUSE_S = 0.002
+IDLE_S = 0.05  # longest wait for a frame, so that commands are heard
+SILENCE_S = 0.01  # at the end: the bus has nothing more
+DRAIN_S = 1.0  # at the end: longest wait for that
+FIRST_ROWS = 1 << 14
+
+RUN_STATES = choices("RUN_CTRL", "RunState")
+RUNNING, ENDED = RUN_STATES["running"], RUN_STATES["ended"]
+
+
+class Recorder:
+    """Keeps the frames of the current run, and tells what each run was."""
+
+    def __init__(self, trace: TraceWriter | None = None, keep_frames: Path | None = None) -> None:
+        """Wait for the first run.
+
+        :param trace: where frames, truth and summaries are logged.
+        :param keep_frames: folder for `frames_RUN.npy`, the FRAME rows of each run.
+        """
+        self.run: int | None = None  # number of the current run
+        self.tick = 0  # of the current run
+        self._trace = trace
+        self._keep_frames = keep_frames
+        self._digest = Digest()
+        self._rows = np.empty(FIRST_ROWS, FRAME)
+        self._count = 0  # of _rows that are this run's
+        self._logged = 0  # of these, in the trace
+        self._logged_tick = 0
+
+    @property
+    def frames(self) -> np.ndarray:
+        """The FRAME rows of the current run so far."""
+        return self._rows[: self._count]
+
+    def take(self, received: list[tuple[int, int]]) -> None:
+        """Take what `bus.recv_frames` gave."""
+        flat = np.fromiter(chain.from_iterable(received), np.int64, 2 * len(received))
+        frame_ids, words = flat[0::2], flat[1::2]
+        if (frame_ids >= FOREIGN).any():
+            ours = frame_ids < FOREIGN
+            frame_ids, words = frame_ids[ours], words[ours]
+        start = 0
+        for at in np.flatnonzero(frame_ids == RUN_CTRL.frame_id).tolist():
+            if e2e.check(int(words[at]), -1, RUN_CTRL.data_id) != e2e.OK:
+                continue
+            state = int(decode_column(words[at], RUN_CTRL.RunState))
+            number = int(decode_column(words[at], RUN_CTRL.Iteration))
+            if self.run is not None and (state != RUNNING or number != self.run):
+                self._append(frame_ids[start:at], words[start:at])
+                self._end_run(complete=state == ENDED and number == self.run)
+            if self.run is None and state == RUNNING:
+                self._begin_run(number)
+                start = at
+        if self.run is not None:
+            self._append(frame_ids[start:], words[start:])
+            if self.tick >= self._logged_tick + BATCH_TICKS:
+                self._log(int(np.searchsorted(self.frames["tick"], self.tick)))
+
+    def obey(self, command: dict[str, Any]) -> None:
+        """Log what the parent knows of a run: `truth` or `summary`."""
+        if self._trace is None:
+            return
+        if command["command"] == "truth":
+            self._trace.truth(command["run"], np.load(command["file"]))
+        else:
+            self._trace.run_summary(command["run"], command["row"])
+
+    def finish(self) -> None:
+        """End a run that was cut short, and the trace. Raises TraceError if it is incomplete."""
+        if self.run is not None:
+            self._end_run(complete=False)
+        if self._trace is not None:
+            self._trace.close()
+
+    def _begin_run(self, number: int) -> None:
+        self.run = number
+        self.tick = self._count = self._logged = self._logged_tick = 0
+
+    def _append(self, frame_ids: np.ndarray, words: np.ndarray) -> None:
+        end = self._count + len(words)
+        if end > len(self._rows):
+            larger = np.empty(max(end, 2 * len(self._rows)), FRAME)
+            larger[: self._count] = self.frames
+            self._rows = larger
+        rows = self._rows[self._count : end]
+        closes = frame_ids == FORCE_CMD.frame_id
+        closed = np.cumsum(closes)
+        rows["tick"] = self.tick + closed - closes
+        rows["frame_id"] = frame_ids
+        rows["payload"] = words
+        self._count = end
+        self.tick += int(closed[-1]) if len(closed) else 0
+
+    def _log(self, end: int) -> None:
+        """Bring the trace up to row `end`."""
+        if self._trace is not None and self.run is not None:
+            self._trace.frames(self.run, self._rows[self._logged : end])
+        self._logged = end
+        self._logged_tick = self.tick
+
+    def _end_run(self, complete: bool) -> None:
+        frames, number = self.frames, self.run
+        assert number is not None
+        self._log(self._count)
+        self._digest.update(frames)
+        if self._keep_frames is not None:
+            np.save(self._keep_frames / f"frames_{number}.npy", frames)
+        lost = lost_frames(frames)
+        if self._trace is not None:
+            if lost:
+                self._trace.text(number, self.tick, f"recorder lost frames: {lost}", "WARN")
+            if not complete:
+                self._trace.text(number, self.tick, f"cut short at tick {self.tick}", "WARN")
+        tell(
+            "run",
+            run=number,
+            ticks=self.tick,
+            frames=len(frames),
+            lost=lost,
+            digest=self._digest.hex(),
+            complete=complete,
+        )
+        self.run = None
+
+
+def lost_frames(frames: np.ndarray) -> dict[str, int]:
+    """How many frames of each message are missing in a run, by their counters; only those > 0.
+
+    Fifteen frames of one message that are lost in a row are not seen.
+    """
+    lost = {}
+    for message in MESSAGES:
+        _, words = columns(frames, message)
+        steps = np.diff(decode_column(words, message.Counter)) % e2e.COUNTER_PERIOD
+        missing = int(np.sum(steps[steps > 0] - 1))  # a step of 0 is a frame that came twice
+        if missing:
+            lost[message.name] = missing
+    return lost
+
+
+def record(
+    bus: can.BusABC, recorder: Recorder, commands: queue.SimpleQueue[dict[str, Any]], stop: Stop
+) -> None:
+    """Record until `stop`. Raises can.CanError if the bus is gone."""
+    while not stop.requested:
+        received = recv_frames(bus, IDLE_S)
+        if received:
+            recorder.take(received)
+        while not commands.empty():
+            command = commands.get()
+            if command["command"] == "stop":
+                stop.requested = True
+            else:
+                recorder.obey(command)
+        if received:
+            time.sleep(PAUSE_S)
+    deadline = time.monotonic() + DRAIN_S
+    while (received := recv_frames(bus, SILENCE_S)) and time.monotonic() < deadline:
+        recorder.take(received)
+
+
+def save_settings(path: Path, reference: Reference, **settings: Any) -> None:
+    """Write the file for `--trace`: what TraceWriter takes, but for its path."""
+    np.savez(
+        path,
+        settings=np.array(json.dumps(settings)),
+        position_m=reference.position_m,
+        speed_m_s=reference.speed_m_s,
+        acceleration_m_s2=reference.acceleration_m_s2,
+    )
+
+
+def open_trace(path: Path, settings_file: Path) -> TraceWriter:
+    """The trace that `save_settings` described. Raises OSError, or TraceError."""
+    with np.load(settings_file) as stored:
+        settings = json.loads(str(stored["settings"]))
+        reference = SimpleNamespace(
+            position_m=stored["position_m"],
+            speed_m_s=stored["speed_m_s"],
+            acceleration_m_s2=stored["acceleration_m_s2"],
+        )
+    return TraceWriter(path, reference=reference, **settings)
+
+
+def main() -> int:
+    """Exit status 0 after a stop, 1 for bad input or a trace that is incomplete, 2 without bus."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.recorder",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--bus", required=True)
+    parser.add_argument("--out", type=Path, required=True, help="folder of trace.rrd")
+    parser.add_argument("--trace", type=Path, metavar="FILE", help="from save_settings; else none")
+    parser.add_argument("--keep-frames", type=Path, metavar="DIR", help="for frames_RUN.npy")
+    arguments = parser.parse_args()
+    stop = Stop()
+    # A recorder without a parent ends with Ctrl-C, and keeps what it has.
+    signal.signal(signal.SIGINT, signal.getsignal(signal.SIGTERM))
+    commands: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    follow_parent(commands.put)
+    try:
+        trace = None
+        if arguments.trace is not None:
+            trace = open_trace(arguments.out / "trace.rrd", arguments.trace)
+        recorder = Recorder(trace, arguments.keep_frames)
+        bus = open_bus(arguments.bus)
+    except (OSError, ValueError) as error:  # the bus, the trace, its settings
+        tell("error", message=f"recorder: {error}")
+        return 1
+    e2e.check(0, -1, RUN_CTRL.data_id)  # compiles, or loads what was compiled before
+    gc.freeze()  # the garbage collector need not look at all of Rerun again and again
+    tell("ready")
+    status = 0
+    try:
+        record(bus, recorder, commands, stop)
+    except can.CanError as error:
+        tell("error", message=f"recorder: bus {arguments.bus} is gone: {error}")
+        status = 2
+    except (OSError, ValueError) as error:
+        tell("error", message=f"recorder: {error}")
+        status = 1
+    try:
+        recorder.finish()
+    except (OSError, ValueError) as error:
+        tell("error", message=f"recorder: {error}")
+        status = 1
+    bus.shutdown()
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())
