@@ -37,8 +37,8 @@ from can_dbc.hub_server import (
     ERROR,
     ERROR_STATE,
     EXTENDED,
+    FD_FORMAT,
     FD_FRAME,
-    FD_FRAME_STRUCT,
     FRAME,
     OVERRUN,
     OWN,
@@ -101,7 +101,7 @@ class HubBus(can.BusABC):
         self.frames_lost = 0
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self._fd = fd
-        self._frame = FD_FRAME_STRUCT if fd else FRAME
+        self._frame = FD_FRAME if fd else FRAME
         self._frame_words, self._stamped_words = _SENT_WORDS[fd], _RECEIVED_WORDS[fd]
         self._stamped_size = STAMP.size + self._frame.size
         self._hub_filters = _filter_words(can_filters)
@@ -114,7 +114,6 @@ class HubBus(can.BusABC):
         self._position = 0  # in _received, of the next frame
         self._timeout: float | None = None  # that the socket is set to
         self._send_lock = threading.Lock()
-        self._hub_is_gone = False
         super().__init__(channel=channel, can_filters=can_filters, **kwargs)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
@@ -125,6 +124,8 @@ class HubBus(can.BusABC):
         :raises can.CanOperationError: the hub is gone, or did not take it in time.
         """
         word, flags = msg.arbitration_id, 0
+        if not 0 <= word < (1 << 29 if msg.is_extended_id else _STANDARD_IDS):
+            raise ValueError(f"{self.channel_info}: identifier {word:#x} has too many bits")
         if msg.is_extended_id:
             word |= EXTENDED
         if msg.is_remote_frame:
@@ -132,7 +133,7 @@ class HubBus(can.BusABC):
         if msg.is_error_frame:
             word |= ERROR
         if msg.is_fd:
-            flags |= FD_FRAME
+            flags |= FD_FORMAT
             if msg.bitrate_switch:
                 flags |= BITRATE_SWITCH
             if msg.error_state_indicator:
@@ -186,9 +187,9 @@ class HubBus(can.BusABC):
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that still receives
         self._socket.close()
-        if self._hub_is_gone:
-            with contextlib.suppress(OSError), _directory_lock(self._path.parent):
-                _remove_stale_socket(self._path)
+        # The hub deletes its socket itself, unless it was killed.
+        with contextlib.suppress(OSError), _directory_lock(self._path.parent):
+            _remove_stale_socket(self._path)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if not self._fill(timeout):
@@ -209,7 +210,7 @@ class HubBus(can.BusABC):
             channel=self.channel,
             dlc=length,
             data=data[:length],
-            is_fd=bool(flags & FD_FRAME),
+            is_fd=bool(flags & FD_FORMAT),
             is_rx=not flags & OWN,
             bitrate_switch=bool(flags & BITRATE_SWITCH),
             error_state_indicator=bool(flags & ERROR_STATE),
@@ -283,7 +284,6 @@ class HubBus(can.BusABC):
     def _gone(self, error: OSError | None) -> can.CanOperationError:
         if self._is_shutdown:
             return can.CanOperationError(f"{self.channel_info}: the bus is shut down")
-        self._hub_is_gone = True
         reason = f": {error.strerror or error}" if error else ""
         return can.CanOperationError(
             f"{self.channel_info}: the hub (process {self.hub_pid}) is gone{reason}"

@@ -41,13 +41,13 @@ REMOTE = 0x4000_0000
 ERROR = 0x2000_0000
 BITRATE_SWITCH = 0x01
 ERROR_STATE = 0x02
-FD_FRAME = 0x04
+FD_FORMAT = 0x04
 # Flags that only the hub sets; linux/can.h leaves these bits free.
 OWN = 0x40  # the receiver sent this frame itself
 OVERRUN = 0x80  # the hub dropped frames of this receiver; their number is data[4:8]
 
 FRAME = struct.Struct("<IBBxx8s")
-FD_FRAME_STRUCT = struct.Struct("<IBBxx64s")
+FD_FRAME = struct.Struct("<IBBxx64s")
 STAMP = struct.Struct("<Q")
 FLAGS_OFFSET = 13  # of the flags byte in a stamped frame
 
@@ -208,7 +208,7 @@ def answer(node: Node, fields: dict[str, int]) -> None:
 def broadcast(hub: Hub, source: Node, chunk: bytes) -> list[Node]:
     """Queue the frames in `chunk` for all who are to have them; returns these nodes."""
     data = source.received + chunk if source.received else chunk
-    size = FD_FRAME_STRUCT.size if source.fd else FRAME.size
+    size = FD_FRAME.size if source.fd else FRAME.size
     end = len(data) - len(data) % size
     source.received = data[end:]
     stamp = STAMP.pack(time.time_ns())
@@ -242,14 +242,14 @@ def marked_own(frame: bytes) -> bytes:
 
 def with_fd_size(frames: list[bytes]) -> list[bytes]:
     """Classic stamped frames in the size of a node with `fd`."""
-    padding = bytes(FD_FRAME_STRUCT.size - FRAME.size)
+    padding = bytes(FD_FRAME.size - FRAME.size)
     return [frame + padding for frame in frames]
 
 
 def with_classic_size(frames: list[bytes]) -> list[bytes]:
     """The classic ones of stamped frames, in the size of a node without `fd`."""
     size = STAMP.size + FRAME.size
-    return [frame[:size] for frame in frames if not frame[FLAGS_OFFSET] & FD_FRAME]
+    return [frame[:size] for frame in frames if not frame[FLAGS_OFFSET] & FD_FORMAT]
 
 
 def passes(frame: bytes, filters: list[tuple[int, int]]) -> bool:
@@ -260,7 +260,7 @@ def passes(frame: bytes, filters: list[tuple[int, int]]) -> bool:
 
 def enqueue(node: Node, frames: list[bytes]) -> None:
     """Append to the node's queue, or count the frames as lost."""
-    size = STAMP.size + (FD_FRAME_STRUCT.size if node.fd else FRAME.size)
+    size = STAMP.size + (FD_FRAME.size if node.fd else FRAME.size)
     # Once frames are lost, so are all until the queue is empty: one gap of known place and length.
     if node.lost or len(node.queue) + len(frames) * size > QUEUE_FRAMES * size:
         node.lost += len(frames)
@@ -293,7 +293,7 @@ def write(hub: Hub, node: Node) -> None:
 def overrun_record(node: Node) -> bytes:
     """The record that tells a node how many frames it has lost, as a controller's error frame."""
     data = struct.pack("<xBxxI", _RECEIVE_OVERFLOW, min(node.lost, 0xFFFF_FFFF))
-    frame = FD_FRAME_STRUCT if node.fd else FRAME
+    frame = FD_FRAME if node.fd else FRAME
     stamp = STAMP.pack(time.time_ns())
     return stamp + frame.pack(ERROR | _CONTROLLER_PROBLEM, 8, OVERRUN, data)
 

@@ -245,7 +245,7 @@ def _durations(ramp: Ramp, number: int, change_m_s: float, units: Units) -> tupl
 
 def _snap(ticks: float) -> float:
     """A time without rounding noise: what falls on a tick on paper does so here."""
-    return round(ticks, 8)
+    return round(ticks, 9)
 
 
 def _ramp_ticks(time_s: float, number: int, key: str, units: Units) -> int:

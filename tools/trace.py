@@ -358,7 +358,7 @@ class TraceWriter:
             if rows:
                 bars = rr.BarChart(
                     [each[key] for each in rows],
-                    abscissa=[each["run"] for each in rows],
+                    abscissa=[each["run"] - 0.5 for each in rows],  # of the left edge
                     color=BLUE,
                 )
                 self._stream.log(f"runs/bars/{key}", bars, static=True, strict=True)

@@ -6,9 +6,9 @@
     u     = -g0 delta - h lam rho sgn(delta)                         (62)
     h'    = -g1 h + g2 q rho,   h(0) = 0                             (63), Euler
 
-No memory and no feed-forward of the reference acceleration. The paper's lambda-dot is lambda^2 misprinted: with lam rho =
-lam^2 |delta| / (q + eps1) both equations read as printed. It gives no gains. eps1 chooses between two behaviours: where
-h lam^2 / eps1 exceeds about 2 M / Ts the sampled loop chatters.
+No memory and no feed-forward of the reference acceleration. The lambda-dot of the paper's print is
+lambda^2: lam rho = lam^2 |delta| / (q + eps1). The paper gives no gains. eps1 chooses between two
+behaviours: the sampled loop chatters where h lam^2 / eps1 exceeds about 2 M / Ts.
 
 Everything is divided by the mass M: f = u/M, h/M, g0/M, g2/M.
 
@@ -19,7 +19,8 @@ Everything is divided by the mass M: f = u/M, h/M, g0/M, g2/M.
 | rho    | -     | Q30                | g2 Ts/M   | m/s^2 | Q40    |
 | h/M    | m/s^2 | Q40, int64, to 16  | eps1      | -     | Q20    |
 
-h is finer than the table of `controller/q.py`: one tick changes it by 1e-11 m/s^2, and lam multiplies it by up to 1057.
+h is finer than the table of `controller/q.py`: one tick changes it by 1e-11 m/s^2, and lam
+multiplies it by up to 1057.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
-    """PARAMS, shape (1,), from SI gains. Raises CalibrationError where a gain does not fit its format."""
+    """PARAMS, shape (1,), from SI gains. Raises CalibrationError where a gain does not fit."""
     mass, period = vehicle.mass_kg, vehicle.period_s
     params = np.zeros(1, PARAMS)
     params["alpha"] = fixed("alpha", gains.alpha, 16)

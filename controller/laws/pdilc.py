@@ -4,8 +4,8 @@
     u_i = u_{i-1} + kp eps_i + kD (eps_i[k] - eps_i[k-1]) / Ts       along runs
     u_0 = the force of the PID (60)                                  run 0
 
-The learned word is the force itself. Everything is divided by the mass M: f = u/M. Run 0 replaces what the memory holds by the
-PID's force, so that a second run 0 begins the learning anew.
+The learned word is the force itself. Everything is divided by the mass M: f = u/M. Run 0 replaces
+what the memory holds by the PID's force, so that a second run 0 begins the learning anew.
 
 | symbol | unit  | format        | symbol          | unit | format |
 | eps    | m/s   | Q24           | kp/M, kD/(M Ts) | 1/s  | Q24    |
@@ -55,7 +55,7 @@ class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
-    """PARAMS, shape (1,), from SI gains. Raises CalibrationError where a gain does not fit its format."""
+    """PARAMS, shape (1,), from SI gains. Raises CalibrationError where a gain does not fit."""
     mass, period = vehicle.mass_kg, vehicle.period_s
     params = np.zeros(1, PARAMS)
     params["initial"] = pid_law.calibrate(

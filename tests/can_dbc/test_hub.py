@@ -41,6 +41,16 @@ def received_until_end(bus: can.BusABC) -> list[can.Message]:
     return messages  # type: ignore[return-value]
 
 
+def received(bus: HubBus, count: int) -> list[tuple[int, int]]:
+    """The next `count` frames."""
+    frames: list[tuple[int, int]] = []
+    while len(frames) < count:
+        new = bus.recv_frames(TIMEOUT_S)
+        assert new, f"only {len(frames)} of {count} frames came"
+        frames += new
+    return frames
+
+
 @st.composite
 def messages(draw: st.DrawFn, fd: bool = True) -> can.Message:
     """Any data or remote message that a CAN controller can send."""
@@ -118,6 +128,9 @@ def test_fd_frames_pass_by_nodes_that_did_not_ask_for_them(node):
         can.Message(is_fd=True, data=bytes(12)),
         can.Message(data=bytes(9)),
         can.Message(dlc=9),
+        can.Message(arbitration_id=0x800, is_extended_id=False),
+        can.Message(arbitration_id=0x2000_0000),
+        can.Message(arbitration_id=-1),
     ],
 )
 def test_what_does_not_fit_is_refused(node, message):
@@ -230,9 +243,7 @@ PAYLOADS = st.integers(-(2**63), 2**63 - 1)
 def test_frames_of_a_node_arrive_at_once(node_pairs, fd, frames):
     sender, receiver, plain = node_pairs[fd]
     sender.send_frames(frames)
-    arrived = []
-    while len(arrived) < len(frames):
-        arrived += receiver.recv_frames(TIMEOUT_S)
+    arrived = received(receiver, len(frames))
     assert arrived == frames
     for can_id, payload in frames:
         data = payload.to_bytes(8, "little", signed=True)
@@ -289,9 +300,7 @@ def test_no_frame_of_a_burst_is_lost(node):
     sender, receiver = node(), node()
     frames = [(count & 0x7FF, count) for count in range(50_000)]
     sender.send_frames(frames)
-    arrived = []
-    while len(arrived) < len(frames):
-        arrived += receiver.recv_frames(TIMEOUT_S)
+    arrived = received(receiver, len(frames))
     assert arrived == frames
     assert receiver.frames_lost == 0
 
@@ -301,13 +310,9 @@ def test_a_reader_that_slept_finds_all_frames(node):
     for start in range(0, 60_000, 1000):
         frames = [(1, count) for count in range(start, start + 1000)]
         sender.send_frames(frames)
-        arrived = []
-        while len(arrived) < len(frames):
-            arrived += awake.recv_frames(TIMEOUT_S)
+        arrived = received(awake, len(frames))
         assert arrived == frames
-    found = []
-    while len(found) < 60_000:
-        found += sleeper.recv_frames(TIMEOUT_S)
+    found = received(sleeper, 60_000)
     assert [payload for _, payload in found] == list(range(60_000))
     assert sleeper.frames_lost == 0
 
@@ -320,9 +325,7 @@ def test_nodes_that_start_at_once_find_each_other(runtime_dir):
         with HubBus("together") as bus:
             all_open.wait(TIMEOUT_S)
             bus.send_frames([(index, 0)])
-            heard: set[int] = set()
-            while len(heard) < count - 1:
-                heard |= {can_id for can_id, _ in bus.recv_frames(TIMEOUT_S)}
+            heard = {can_id for can_id, _ in received(bus, count - 1)}
             all_received.wait(TIMEOUT_S)
             return bus.hub_pid, heard | {index}
 
@@ -341,9 +344,7 @@ def test_what_threads_send_at_once_is_not_mixed(node):
 
     with ThreadPoolExecutor(3) as pool:
         list(pool.map(send_all, range(3)))
-    arrived: list[tuple[int, int]] = []
-    while len(arrived) < 3 * count:
-        arrived += peer.recv_frames(TIMEOUT_S)
+    arrived = received(peer, 3 * count)
     for can_id in range(3):
         assert [payload for each, payload in arrived if each == can_id] == list(range(count))
 

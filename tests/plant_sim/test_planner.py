@@ -6,7 +6,7 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from plant_sim.planner import PlanError, ProfilePlan, Ramp, SpeedLimit, limit_at, plan_profile
@@ -391,6 +391,7 @@ def test_any_plan_keeps_its_promises(period_s, speeds, shapes, cruise_ticks):
     assert profile.position_m[-1] == pytest.approx(length_m, abs=0.2 * period_s * sum(changes))
 
 
+@settings(max_examples=30)  # each solves by some forty plans
 @given(
     period_s=PERIODS_S,
     distance_m=st.floats(1000.0, 1900.0),
@@ -628,15 +629,15 @@ def test_a_closing_condition_that_cannot_be_met_is_refused(text, message):
 
 
 def test_a_sinusoid_below_the_resolution_of_the_table_is_refused():
-    """At 1 ms its jerk, 0.016 m/s^3, is three units."""
+    """At 1 ms its jerk, 0.003 m/s^3, is half a unit."""
     plan = ProfilePlan(
         duration_s=40.0,
         max_speed_m_s=1.0,
         max_acceleration_m_s2=0.1,
         max_jerk_m_s3=0.1,
-        ramps=(Ramp(to_m_s=1.0, sinusoidal_s=20.0), Ramp(to_m_s=0.0, sinusoidal_s=20.0)),
+        ramps=(Ramp(to_m_s=0.2, sinusoidal_s=20.0), Ramp(to_m_s=0.0, sinusoidal_s=20.0)),
     )
-    assert evaluate(plan_profile(plan, 0.01), 0.01).position_m[-1] == pytest.approx(20.0, abs=1e-3)
+    assert evaluate(plan_profile(plan, 0.01), 0.01).position_m[-1] == pytest.approx(4.0, abs=1e-3)
     with pytest.raises(PlanError, match=r"^ramp 1: no table of 0.001 s periods follows this"):
         plan_profile(plan, 0.001)
 

@@ -1,0 +1,265 @@
+"""The main job through the product: SIL and HIL agree, and whatever ends a run early ends it cleanly."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+SHORT = """
+base = "subway"
+title = "A short run between two stops"
+runs = 2
+
+[profile]
+duration_s = 20.0
+distance_m = 45.0
+max_speed_m_s = 5.0
+ramps = [
+    {{ to_m_s = "solved", start_s = 1.0, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 }},
+    {{ to_m_s = 0.0, end_s = 18.0, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 }},
+]
+{more}
+"""
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Path:
+    """A scenario of 2001 ticks."""
+    path = tmp_path / "short.toml"
+    path.write_text(SHORT.format(more=""))
+    return path
+
+
+def ato_hil(*arguments: str, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "tools.cli", *arguments],
+        cwd=cwd,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+def summary(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+def channel(tmp_path: Path) -> str:
+    """A hub of this test's own."""
+    return f"hub:{tmp_path.name[-20:]}"
+
+
+def test_hil_gives_the_bits_of_sil(short: Path, tmp_path: Path) -> None:
+    sil = ato_hil("run", str(short), "--mode", "sil", "--out", "sil", cwd=tmp_path)
+    assert sil.returncode == 0, sil.stderr
+    hil = ato_hil("run", str(short), "--bus", channel(tmp_path), "--out", "hil", cwd=tmp_path)
+    assert hil.returncode == 0, hil.stderr
+    one, other = summary(tmp_path / "sil"), summary(tmp_path / "hil")
+    assert one["digest"] == other["digest"]
+    for a, b in zip(one["runs"], other["runs"], strict=True):
+        a.pop("ticks_per_s"), b.pop("ticks_per_s")
+        assert a == b
+    assert (tmp_path / "sil" / "trace.rrd").stat().st_size > 100_000
+    assert (tmp_path / "hil" / "trace.rrd").stat().st_size > 100_000
+
+
+def test_the_summary_has_its_stable_keys(short: Path, tmp_path: Path) -> None:
+    done = ato_hil(
+        "run", str(short), "--mode", "sil", "--no-trace", "--seed", "7", "--out", "o", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    found = summary(tmp_path / "o")
+    assert found["schema"] == 1
+    assert {
+        "scenario",
+        "law",
+        "mode",
+        "bus",
+        "pace",
+        "seed",
+        "digest",
+        "controller",
+        "runs",
+    } <= set(found)
+    assert (found["scenario"], found["law"], found["mode"]) == ("short", "cailc", "sil")
+    assert (found["pace"], found["seed"]) == ("lockstep", 7)
+    assert set(found["controller"]) == {"state_bytes", "memory_bytes"}
+    assert [row["run"] for row in found["runs"]] == [1, 2]
+    assert {
+        *("run", "ticks", "max_delta_m_s", "max_speed_error_m_s", "max_position_error_m"),
+        *("rms_speed_error_m_s", "rms_position_error_m", "stop_error_m", "max_acceleration_m_s2"),
+        *("rms_command_jerk_m_s3", "overspeed_margin_m_s", "energy_kwh_per_t", "ticks_per_s"),
+        "faults",
+    } <= set(found["runs"][0])
+    assert found["runs"][0]["ticks"] == 2001
+
+
+def test_the_interpreted_run_gives_the_bits_of_the_compiled_one(tmp_path: Path) -> None:
+    path = tmp_path / "short.toml"
+    path.write_text(SHORT.format(more="").replace("runs = 2", "runs = 1"))
+    digests = []
+    for mode in ("sil", "mil"):
+        done = ato_hil("run", str(path), "--mode", mode, "--no-trace", "--out", mode, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        digests.append(summary(tmp_path / mode)["digest"])
+    assert digests[0] == digests[1]
+
+
+def test_learning_goes_on_from_a_memory_file(short: Path, tmp_path: Path) -> None:
+    arguments = ("run", str(short), "--mode", "sil", "--no-trace", "--memory", "learned.bin")
+    first = ato_hil(*arguments, "--runs", "1", "--out", "a", cwd=tmp_path)
+    second = ato_hil(*arguments, "--runs", "1", "--out", "b", cwd=tmp_path)
+    both = ato_hil("run", str(short), "--mode", "sil", "--no-trace", "--out", "c", cwd=tmp_path)
+    assert first.returncode == second.returncode == both.returncode == 0, second.stderr
+    key = "rms_position_error_m"
+    runs = summary(tmp_path / "c")["runs"]
+    assert summary(tmp_path / "a")["runs"][0][key] == runs[0][key]
+    assert summary(tmp_path / "b")["runs"][0][key] == runs[1][key]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["run", "nowhere"], "scenario 'nowhere' is unknown"),
+        (["run", "missing.toml"], "missing.toml: no such scenario file"),
+        (["run", "subway", "--law", "magic"], "law 'magic' is unknown, expected one of"),
+        (["run", "wrong.toml"], "wrong.toml: key actuator.force_max_m_s2"),
+        (["run", "extra.toml"], "extra.toml: key sensors: Object contains unknown field `colour`"),
+        (["run", "gains.toml"], "laws.cailc: Object contains unknown field `gamma_ray`"),
+        (["run", "range.toml"], "laws.cailc: alpha: 1e+09 is outside what the firmware holds"),
+        (["run", "plan.toml"], "plan.toml: [profile]:"),
+        (["run", "toml.toml"], "toml.toml: not valid TOML"),
+        (["run", "subway", "--bus", "socketcan:nosuch0"], "nosuch0"),
+        (["run", "subway", "--bus", "nonsense"], "expected auto, hub"),
+        (["run", "subway", "--bus", "virtual:x"], "lives inside one process"),
+        (["run", "subway", "--memory", "foreign.bin"], "foreign.bin: not a learning memory"),
+        (["run", "subway", "--out", "a-file/x"], "a-file/x: cannot write there"),
+    ],
+)
+def test_bad_input_is_one_clear_line(tmp_path: Path, arguments: list[str], says: str) -> None:
+    wrong = {
+        "wrong": '[actuator]\nforce_max_m_s2 = "much"',
+        "extra": '[sensors]\ncolour = "red"',
+        "gains": "[laws.cailc]\ngamma_ray = 1.0",
+        "range": "[laws.cailc]\nalpha = 1e9",
+        "plan": "[profile]\ndistance_m = 99.0",
+        "toml": "= nothing",
+    }
+    for name, text in wrong.items():
+        (tmp_path / f"{name}.toml").write_text(f'base = "subway"\n{text}\n')
+    (tmp_path / "foreign.bin").write_bytes(b"something else" * 20)
+    (tmp_path / "a-file").write_text("")
+    if "--out" not in arguments:
+        arguments = [*arguments, "--out", "out"]
+    done = ato_hil(*arguments, cwd=tmp_path)
+    assert done.returncode == 1
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_dbc_without_a_needed_signal_is_one_clear_line(tmp_path: Path) -> None:
+    from can_dbc.step import dbc_path
+
+    text = dbc_path().read_text()
+    broken = tmp_path / "broken.dbc"
+    broken.write_text(
+        text.replace(" SG_ PermittedSpeed :", " SG_ Allowed :").replace(
+            " PermittedSpeed ", " Allowed "
+        )
+    )
+    done = ato_hil("run", "subway", "--mode", "sil", cwd=tmp_path, ATO_HIL_DBC=str(broken))
+    assert done.returncode == 1
+    assert "broken.dbc: message ATP_LIMIT has no signal PermittedSpeed" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def start_long_run(tmp_path: Path) -> subprocess.Popen[str]:
+    """A HIL run that would last for minutes, once it is under way."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tools.cli", "run", "subway", "--runs", "50", "--out", "out"]
+        + ["--bus", channel(tmp_path)],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 240
+    while time.monotonic() < deadline:
+        trace = tmp_path / "out" / "trace.rrd"
+        if trace.exists() and trace.stat().st_size > 1_000_000:
+            return process
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.1)
+    raise AssertionError("the run did not begin")
+
+
+def children(process: subprocess.Popen[str]) -> dict[str, int]:
+    """Process ids of the nodes, by module."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            words = (entry / "cmdline").read_bytes().split(b"\0")
+            parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
+        except (OSError, IndexError, ValueError):
+            continue
+        if parent == process.pid and b"-m" in words:
+            found[words[words.index(b"-m") + 1].decode()] = int(entry.name)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("victim", "number", "says", "code"),
+    [
+        ("controller.process", signal.SIGKILL, "the controller process ended (signal 9)", 3),
+        ("plant_sim.process", signal.SIGKILL, "the plant process ended (signal 9)", 3),
+        ("tools.recorder", signal.SIGKILL, "the recorder process ended (signal 9)", 3),
+        ("controller.process", signal.SIGSTOP, "controller is silent: no FORCE_CMD for tick", 3),
+        (None, signal.SIGINT, "interrupted", 130),
+    ],
+)
+def test_what_ends_a_run_early_is_named_and_leaves_nothing_behind(
+    tmp_path: Path, victim: str | None, number: signal.Signals, says: str, code: int
+) -> None:
+    process = start_long_run(tmp_path)
+    nodes = children(process)
+    assert set(nodes) == {"controller.process", "plant_sim.process", "tools.recorder"}
+    os.kill(nodes[victim] if victim else process.pid, number)
+    _out, errors = process.communicate(timeout=60)
+    assert process.returncode == code, errors
+    assert says in errors
+    assert "Traceback" not in errors
+    for pid in nodes.values():
+        assert not Path(f"/proc/{pid}").exists()
+    assert summary(tmp_path / "out")["ended_early"]
+    if victim != "tools.recorder":
+        check = subprocess.run(
+            [Path(sys.executable).with_name("rerun"), "rrd", "verify", "out/trace.rrd"],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert check.returncode == 0, check.stderr
+
+
+def test_two_sessions_do_not_share_a_bus(tmp_path: Path) -> None:
+    process = start_long_run(tmp_path)
+    try:
+        second = ato_hil("run", "subway", "--bus", channel(tmp_path), "--out", "b", cwd=tmp_path)
+        assert second.returncode == 1
+        assert "carries other traffic" in second.stderr
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
