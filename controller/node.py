@@ -75,7 +75,7 @@ def build(calibration: Calibration, memory_file: Path | None = None) -> Controll
         calibration.params[0]["memory"], np.dtype(calibration.memory_dtype).type
     )
     if memory_file is not None and memory_file.exists():
-        cells[0] = store.load(memory_file, calibration, cells.shape[1:]).cells
+        cells[0] = store.load(memory_file, calibration).cells
     tick = build_tick(law_step(module))
     return Controller(
         calibration=calibration,
@@ -89,6 +89,12 @@ def build(calibration: Calibration, memory_file: Path | None = None) -> Controll
         tx=rows(mailboxes()),
         memory_file=memory_file,
     )
+
+
+def check_memory_file(calibration: Calibration, memory_file: Path) -> None:
+    """Raises store.MemoryFileError if there is such a file and `build` would refuse it."""
+    if memory_file.exists():
+        store.load(memory_file, calibration)
 
 
 def cycle(node: Controller, period: int) -> None:

@@ -64,8 +64,10 @@ def save(path: Path, calibration: Calibration, cells: np.ndarray, iteration: int
         os.close(directory)
 
 
-def load(path: Path, calibration: Calibration, shape: tuple[int, ...]) -> Stored:
-    """Reads a memory of `shape` (cells, words) for the calibration's law and scenario."""
+def load(path: Path, calibration: Calibration) -> Stored:
+    """Reads the memory of the calibration's law and scenario. Raises MemoryFileError."""
+    settings = calibration.params[0]["memory"]
+    shape = (int(settings["cells"]), int(settings["words"]))
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -85,7 +87,7 @@ def load(path: Path, calibration: Calibration, shape: tuple[int, ...]) -> Stored
     if digest != calibration.scenario_digest:
         raise MemoryFileError(f"{path}: learned on another scenario (digest {digest}, expected {calibration.scenario_digest})")
     dtype = np.dtype(calibration.memory_dtype)
-    if (cells, words) != tuple(shape) or width != dtype.itemsize:
+    if (cells, words) != shape or width != dtype.itemsize:
         raise MemoryFileError(
             f"{path}: {cells} cells of {words} words of {width} bytes, expected {shape[0]} of {shape[1]} of {dtype.itemsize}"
         )

@@ -1,8 +1,12 @@
-"""Actuators: transport delay, command slope limit, first-order lag that differs for traction and brake."""
+"""Actuators: transport delay, limits of force and slope, first-order lag of traction and brake.
+
+A channel is an actuator: channel 0 alone for a train that is one mass, or one a car. The limits are
+those of the whole train; with several channels each gives way by its share.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -12,15 +16,18 @@ from can_dbc.step import int64, step
 CHANNELS_MAX = 8
 DELAY_MAX = 16
 
+Positive = Annotated[float, msgspec.Meta(gt=0, le=1e3)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e3)]
+
 
 class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Data of the actuators; 0 turns a property off."""
 
-    force_max_m_s2: float  # largest specific force of the whole train
+    force_max_m_s2: Positive  # largest specific force of the whole train
     delay_ticks: int = 0  # from command to actuator
-    lag_traction_s: float = 0.0
-    lag_brake_s: float = 0.0
-    jerk_max_m_s3: float = 0.0  # slope of the command
+    lag_traction_s: NotNegative = 0.0
+    lag_brake_s: NotNegative = 0.0
+    jerk_max_m_s3: NotNegative = 0.0  # slope of the command
 
     def __post_init__(self) -> None:
         if not 0 <= self.delay_ticks < DELAY_MAX:
@@ -30,6 +37,7 @@ class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 PARAMS = np.dtype(
     [
         ("delay", np.int64),  # control periods
+        ("limit", np.float64),  # N, of the whole train
         ("slope", np.float64),  # N a control period, of the whole train; 0: free
         ("traction_gain", np.float64),  # h / tau of an integration step; 1: no lag
         ("brake_gain", np.float64),
@@ -50,6 +58,7 @@ def calibrate(actuator: Actuator, mass_kg: float, period_s: float, step_s: float
     """PARAMS, shape (1,), for an integration step of `step_s`."""
     params = np.zeros(1, PARAMS)
     params["delay"] = actuator.delay_ticks
+    params["limit"] = actuator.force_max_m_s2 * mass_kg
     params["slope"] = actuator.jerk_max_m_s3 * mass_kg * period_s
     params["traction_gain"] = _gain(actuator.lag_traction_s, step_s)
     params["brake_gain"] = _gain(actuator.lag_brake_s, step_s)
@@ -73,13 +82,42 @@ def reset(state: Any) -> None:
 
 @step
 def command(params: Any, state: Any, channel: Any, force_n: Any) -> None:
-    """A new command, once a control period, for one channel; `shift` follows when all channels have theirs."""
+    """A new command, once a control period, for a train with one actuator; `shift` follows."""
     head = int64(state.head)
-    state.queue[head, channel] = force_n
+    state.queue[head, channel] = min(max(force_n, -params.limit), params.limit)
     due = state.queue[(head - params.delay) % DELAY_MAX, channel]
     if params.slope > 0.0:
-        due = min(max(due, state.target[channel] - params.slope), state.target[channel] + params.slope)
+        last = state.target[channel]
+        due = min(max(due, last - params.slope), last + params.slope)
     state.target[channel] = due
+
+
+@step
+def command_cars(params: Any, state: Any, cars: Any, effectiveness: Any, force_n: Any) -> None:
+    """New commands, once a control period, for a train with one actuator a car; `shift` follows.
+
+    Car k gives `effectiveness[k] * force_n[k]` at the train. Where the sum meets the limit of force
+    or slope, all cars go the same fraction of their way.
+    """
+    head = int64(state.head)
+    total = 0.0
+    for k in range(cars):
+        total += effectiveness[k] * force_n[k]
+    share = 1.0
+    if abs(total) > params.limit:
+        share = params.limit / abs(total)
+    for k in range(cars):
+        state.queue[head, k] = share * effectiveness[k] * force_n[k]
+
+    late = (head - params.delay) % DELAY_MAX
+    change = 0.0
+    for k in range(cars):
+        change += state.queue[late, k] - state.target[k]
+    share = 1.0
+    if params.slope > 0.0 and abs(change) > params.slope:
+        share = params.slope / abs(change)
+    for k in range(cars):
+        state.target[k] += share * (state.queue[late, k] - state.target[k])
 
 
 @step

@@ -52,6 +52,7 @@ TRUTH = np.dtype(
         ("force_n", np.float64),  # of the actuators at the end of tick k
         ("permitted_speed_m_s", np.float64),
         ("traction_j", np.float64),  # since the start of the run
+        ("coupler_force_n", np.float64),  # largest of any coupler over tick k; 0 for rigid trains
     ]
 )
 
@@ -207,6 +208,12 @@ def read_commands(params: Any, node: Any, rx: Any) -> None:
         node.command_n[7] = get(word, CAR_FORCE_4.Car8) * CAR_FORCE_4.Car8.scale
 
 
+@step
+def no_coupler_force_n(train: Any) -> Any:
+    """Of a model without couplers."""
+    return 0.0
+
+
 def build(model: Any) -> tuple[Any, Any, Any]:
     """Steps around one train model: `begin(params, state)`, `sense(params, limits, state, chance, tx)` and
     `actuate_and_advance(params, track, state, chance, rx, truth)`.
@@ -217,6 +224,7 @@ def build(model: Any) -> tuple[Any, Any, Any]:
     reset_train = model.reset
     advance_train = model.advance
     command_train = model.command
+    coupler_force_n = getattr(model, "coupler_force_n", no_coupler_force_n)
 
     @step
     def begin(params: Any, state: Any) -> None:
@@ -292,6 +300,7 @@ def build(model: Any) -> tuple[Any, Any, Any]:
             chance.disturbance_m_s2,
         )
         truth.force_n = train.force_n
+        truth.coupler_force_n = coupler_force_n(train)
         node.tick += 1
 
     return begin, sense, actuate_and_advance

@@ -11,7 +11,7 @@ import tomllib
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -20,12 +20,17 @@ from plant_sim.actuator import Actuator
 from plant_sim.planner import PlanError, ProfilePlan, plan_profile
 from plant_sim.profile import Profile, evaluate
 from plant_sim.track import Track
-from plant_sim.trains import lumped
+from plant_sim.trains import couplers, lumped
 
 FOLDER = Path(__file__).with_name("scenarios")
 # The train models; key `train.model` chooses. Each file has a Train, PARAMS, STATE, calibrate, and the steps reset, command, advance.
-MODELS: dict[type, ModuleType] = {lumped.Train: lumped}
-AnyTrain = lumped.Train
+MODELS: dict[type, ModuleType] = {lumped.Train: lumped, couplers.Train: couplers}
+AnyTrain = lumped.Train | couplers.Train
+
+Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
+Ticks = Annotated[int, msgspec.Meta(ge=0, le=10_000)]
+MassError = Annotated[float, msgspec.Meta(ge=-0.5, le=1)]
 
 
 class ScenarioError(ValueError):
@@ -36,9 +41,9 @@ class Sensors(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Sensors; 0 turns a property off."""
 
     location: str = "front"  # front | mean (of front and rear)
-    position_step_m: float = 0.0  # quantisation on top of the DBC's
-    speed_step_m_s: float = 0.0
-    speed_noise_m_s: float = 0.0  # standard deviation, white
+    position_step_m: NotNegative = 0.0  # quantisation on top of the DBC's
+    speed_step_m_s: NotNegative = 0.0
+    speed_noise_m_s: NotNegative = 0.0  # standard deviation, white
 
     def __post_init__(self) -> None:
         if self.location not in ("front", "mean"):
@@ -48,8 +53,8 @@ class Sensors(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Load disturbance, uniform, new in each run."""
 
-    amplitude_m_s2: float = 0.0
-    hold_ticks: int = 1  # a value stays for so many ticks
+    amplitude_m_s2: NotNegative = 0.0
+    hold_ticks: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 1  # a value stays for so many ticks
 
 
 class Metrics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"from_s": "from", "to_s": "to"}):
@@ -62,8 +67,9 @@ class Metrics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The controller's settings that do not belong to one law; checked by the controller's calibration."""
 
-    preview_ticks: int = 0  # the reference acceleration is read this far ahead
+    preview_ticks: Ticks = 0  # the reference acceleration is read this far ahead
     distribute: bool = False  # give each car a force of its own
+    mass_error: MassError = 0.0  # the controller works with (1 + mass_error) times the true mass
     memory: dict[str, Any] = {}
     guard: dict[str, Any] = {}
 
@@ -74,7 +80,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     title: str
     law: str  # default law
     runs: int  # default number of runs
-    period_s: float  # control period
+    period_s: Positive  # control period
     train: AnyTrain
     profile: ProfilePlan
     actuator: Actuator
@@ -188,5 +194,11 @@ def _check(path: Path, scenario: Scenario) -> None:
         raise ScenarioError(f"{path}: key law: {scenario.law!r} has no gains, expected a table [laws.{scenario.law}]")
     if scenario.runs < 1:
         raise ScenarioError(f"{path}: key runs: {scenario.runs}, expected 1 or more")
+    if isinstance(scenario.train, couplers.Train):
+        model = "train model 'couplers' takes each car by itself"
+        if not scenario.control.distribute:
+            raise ScenarioError(f"{path}: key control.distribute: {model}, expected true")
+        if scenario.track.application != "smeared":
+            raise ScenarioError(f"{path}: key track.application: {model}, expected 'smeared'")
     if not scenario.profile.limits:
         raise ScenarioError(f"{path}: key profile.limits: expected at least one limit")

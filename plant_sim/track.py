@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
 from can_dbc.step import int64, step
+
+Place = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+Resistance = Annotated[float, msgspec.Meta(ge=-1e3, le=1e3)]
 
 SECTION = np.dtype(
     [
@@ -20,9 +23,9 @@ SECTION = np.dtype(
 class Track(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Additional resistance from each position on; before the first position it is 0."""
 
-    application: str = "point"  # point: at the front for the whole train; smeared: each car at its own place
-    from_m: list[float] = []
-    resistance_n_per_kn: list[float] = []
+    application: str = "point"  # point: at the front for the whole train; smeared: car by car
+    from_m: list[Place] = []
+    resistance_n_per_kn: list[Resistance] = []
 
     def __post_init__(self) -> None:
         if self.application not in ("point", "smeared"):

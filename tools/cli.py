@@ -76,7 +76,7 @@ class Screen:
 
     def note(self, text: str) -> None:
         """One line above the bar."""
-        self.bar.console.print(text, style="dim", soft_wrap=True)
+        self.bar.console.print(text, style="dim", soft_wrap=True, markup=False)
 
     def progress(self, run: int, tick: int) -> None:
         """Moves the bar."""
@@ -116,7 +116,7 @@ def _print_table(title: str, rows: list[dict[str, Any]]) -> None:
 
 
 def _fail(message: str, code: int) -> typer.Exit:
-    errors.print(f"ato-hil: {message}", style="red", soft_wrap=True)
+    errors.print(f"ato-hil: {message}", style="red", soft_wrap=True, markup=False)
     return typer.Exit(code)
 
 

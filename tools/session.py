@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-import time
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from can_dbc.bus import choose_bus, open_bus, recv_frames
+from controller import node
 from controller.interface import fault_names
 from controller.registry import load_law
 from plant_sim.scenario import Loaded, load
@@ -87,6 +87,8 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     if not 1 <= runs <= RUNS_MAX:
         raise SessionError(f"{runs} runs, expected 1 to {RUNS_MAX}")
     calibration = setup.calibration_for(loaded, law)
+    if options.memory is not None:
+        node.check_memory_file(calibration, options.memory)
     _prepare(options.out)
     session = Session(options, loaded, law, setup.run_numbers(law, runs), listener)
     session.summary = {
@@ -153,7 +155,7 @@ def _run_in_process(session: Session, calibration: Any) -> None:
     digest = Digest()
     writer = _trace_writer(session) if options.trace else None
     try:
-        for result, node in sil.run(
+        for result, controller in sil.run(
             loaded,
             calibration,
             runs=session.runs,
@@ -164,8 +166,8 @@ def _run_in_process(session: Session, calibration: Any) -> None:
             digest.update(result.frames)
             session.summary["digest"] = digest.hex()
             session.summary["controller"] = {
-                "state_bytes": node.state_bytes,
-                "memory_bytes": node.memory_bytes,
+                "state_bytes": controller.state_bytes,
+                "memory_bytes": controller.memory_bytes,
             }
             row = _finish_run(
                 session, result.run, result.frames, result.truth, result.seconds, result.faults
@@ -233,15 +235,14 @@ def _run_hil(session: Session, calibration: Any) -> None:
             recorder_arguments=_recorder_arguments(session, kept),
         )
         with closing(events):  # whatever ends the session ends the nodes
-            for node, event, bench in events:
-                _on_event(session, bench, node.name, event, kept)
+            for speaker, event, bench in events:
+                _on_event(session, bench, speaker.name, event, kept)
 
 
 def _refuse_busy_bus(name: str) -> None:
     """Two sessions on one bus would answer each other."""
     with open_bus(name) as bus:
-        time.sleep(0.1)
-        if recv_frames(bus, 0.0):
+        if recv_frames(bus, 0.3):
             raise SessionError(f"bus {name!r} carries other traffic; choose another, e.g. --bus hub:second")
 
 
@@ -277,6 +278,6 @@ def _on_run(
     truth = np.load(plant["file"])
     row = _finish_run(session, run, frames, truth, plant["seconds"], fault_names(plant["faults"]))
     frames_file.unlink()
-    node = bench.nodes["recorder"]
-    node.command(command="truth", run=run, file=plant["file"])
-    node.command(command="summary", run=run, row=row)
+    tap = bench.nodes["recorder"]
+    tap.command(command="truth", run=run, file=plant["file"])
+    tap.command(command="summary", run=run, row=row)

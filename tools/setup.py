@@ -24,7 +24,9 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
             law=law,
             gains=scenario.laws[law],
             vehicle=Vehicle(
-                scenario.train.mass_kg, scenario.period_s, scenario.actuator.force_max_m_s2
+                scenario.train.mass_kg * (1.0 + scenario.control.mass_error),
+                scenario.period_s,
+                scenario.actuator.force_max_m_s2,
             ),
             profile=loaded.segments,
             preview_ticks=scenario.control.preview_ticks,

@@ -29,13 +29,14 @@ def interpreted() -> Iterator[Callable[..., Any]]:
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
-    assert worker.stdin
-    assert worker.stdout
+    requests, answers = worker.stdin, worker.stdout
+    assert requests
+    assert answers
 
     def call(function: str, *arguments: Any) -> Any:
-        pickle.dump((function, arguments), worker.stdin)
-        worker.stdin.flush()
-        answer = pickle.load(worker.stdout)
+        pickle.dump((function, arguments), requests)
+        requests.flush()
+        answer = pickle.load(answers)
         assert not isinstance(answer, str), f"{function}: {answer}"
         result, written = answer
         for mine, theirs in zip(arguments, written, strict=True):
@@ -44,7 +45,7 @@ def interpreted() -> Iterator[Callable[..., Any]]:
         return result
 
     yield call
-    worker.stdin.close()
+    requests.close()
     worker.wait(timeout=10)
 
 

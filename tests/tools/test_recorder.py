@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
 
 from can_dbc import e2e
 from can_dbc.bus import FOREIGN, open_bus, send_frames
@@ -458,7 +459,8 @@ def test_a_killed_recorder_leaves_what_it_had_logged(start: Start, tmp_path: Pat
         wait_for_text(tmp_path / "trace.rrd", b"max_position_error_m")
         process.kill()
         process.wait()
-    assert "/bus/speed/run_01" in entities(tmp_path / "trace.rrd")
+    with pytest.warns(RerunWarning, match="no footer"):
+        assert "/bus/speed/run_01" in entities(tmp_path / "trace.rrd")
 
 
 def wait_for_text(path: Path, text: bytes) -> None:
@@ -469,16 +471,17 @@ def wait_for_text(path: Path, text: bytes) -> None:
 
 def test_a_hub_that_dies_is_an_error_and_the_trace_is_kept(start: Start, tmp_path: Path) -> None:
     process = start("--trace", str(settings_file(tmp_path / "settings.npz")))
-    bus = open_bus("hub")
-    send_frames(bus, Nodes().run(1, 30))
-    os.kill(bus.hub_pid, signal.SIGKILL)  # type: ignore[attr-defined]
-    event = next_event(process)
-    assert event["event"] == "error"
-    assert event["message"].startswith("recorder: bus hub is gone: ")
-    assert next_event(process)["complete"] is False
-    assert process.wait(30) == 2
+    nodes = Nodes()
+    with open_bus("hub") as bus:
+        send_frames(bus, [*nodes.run(1, 30), nodes.control(ENDED, 1)])
+        assert next_event(process)["run"] == 1
+        os.kill(bus.hub_pid, signal.SIGKILL)  # type: ignore[attr-defined]
+        event = next_event(process)
+        assert event["event"] == "error"
+        assert event["message"].startswith("recorder: bus hub is gone: ")
+        assert process.wait(30) == 2
     RrdReader(str(tmp_path / "trace.rrd")).store()
-    bus.shutdown()
+    assert "/bus/speed/run_01" in entities(tmp_path / "trace.rrd")
 
 
 def test_without_trace_there_is_no_file(start: Start, tmp_path: Path) -> None:

@@ -26,8 +26,8 @@ def vehicle() -> Vehicle:
 def run_law() -> Callable[..., Any]:
     """`run_law(name, params, inputs, state=None, cells=None)`: calls a law for each row of inputs.
 
-    Returns outputs (n,), cells (n,) and the state. `state` (1,) is handed from tick to tick, (n,) is
-    one for each row; without it the state starts at 0 and is handed on.
+    Returns outputs (n,), cells (n,) and the state. `state` (1,) is handed from tick to tick, (n,)
+    is one for each row; without it the state starts at 0 and is handed on.
     """
     loops: dict[str, Any] = {}
 
@@ -77,7 +77,7 @@ def inputs_of() -> Callable[..., np.ndarray]:
 
 @pytest.fixture(scope="session")
 def random_inputs(inputs_of: Any) -> Callable[..., np.ndarray]:
-    """`random_inputs(n, seed)`: errors of all sizes, 1e-6 to 16 m and 1e-6 to 100 m/s, to 32 m/s."""
+    """`random_inputs(n, seed)`: errors of all sizes, from 1e-6 to 16 m and 95 m/s, to 32 m/s."""
 
     def make(n: int, seed: int) -> np.ndarray:
         chance = np.random.default_rng(seed)
