@@ -100,17 +100,15 @@ def drive(
     for tick in range(here.loaded.ticks):
         here.sense(here.params, here.limits, here.state, chance, tick, here.tx)
         post(here, bus)
-        deadline = 0.0
+        deadline = time.monotonic() + timeout_s
         while True:
             if FORCE_CMD.frame_id in collect(here, bus, timeout_s):
                 echo = (int(payload[FORCE_CMD.index]) >> TICK_START) & plant.TICK_MASK
                 if echo == tick & plant.TICK_MASK:
                     break
-            now = time.monotonic()
-            deadline = deadline or now + timeout_s
             if stop.requested:
                 raise Stopped
-            if now >= deadline:
+            if time.monotonic() >= deadline:
                 raise SilentNode(
                     f"controller is silent: no FORCE_CMD for tick {tick} of run {run}"
                     f" within {timeout_s:g} s"

@@ -110,7 +110,6 @@ def test_a_word_is_eight_little_endian_bytes(word: int) -> None:
     assert int.from_bytes(data, "little") == word % 2**64
     assert word_of(data) == word
     assert word_of(bytearray(data)) == word
-    assert bytes_of(int(np.int64(word))) == data
 
 
 # Single signals
