@@ -112,15 +112,14 @@ def _rows(mu: list[float], limits: list[int]) -> np.ndarray:
         given = sum(mu[k] * limits[k] for k in full)
         weight = sum(mu[k] ** 2 for k in free)
         reached = limits[full[-1]] / mu[full[-1]] if full else 0.0  # lambda
-        edge = math.ceil(given + reached * weight)
-        row = rows[index]
-        row["edge"] = edge
+        row = np.zeros(1, ROW)
+        row["edge"] = edge = math.ceil(given + reached * weight)
         for k in full:
-            row["start"][k] = limits[k] << SHARE_Q
+            row["start"][0, k] = limits[k] << SHARE_Q
         for k in free:
-            row["share"][k] = round(mu[k] / weight * 2**SHARE_Q)
-            row["start"][k] = round(mu[k] / weight * (edge - given) * 2**SHARE_Q)
-        rows[index + 1 :] = row
+            row["share"][0, k] = round(mu[k] / weight * 2**SHARE_Q)
+            row["start"][0, k] = round(mu[k] / weight * (edge - given) * 2**SHARE_Q)
+        rows[index:] = row
     return rows
 
 

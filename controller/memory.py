@@ -48,7 +48,7 @@ MEMORY_PARAMS = np.dtype(
 
 MEMORY_STATE = np.dtype(
     [
-        ("sum", np.int64, (WORDS_MAX,)),  # of `learn` over the ticks of the open cell
+        ("total", np.int64, (WORDS_MAX,)),  # of `learn` over the ticks of the open cell
         ("generation", np.int32),  # which half is read, 0 or 1
         ("read_cell", np.int32),
         ("read_phase", np.int32),  # tick inside the cell that is read
@@ -64,7 +64,7 @@ MEMORY_STATE = np.dtype(
 def rewind(params: Any, state: Any) -> None:
     """The state at the start of a run; the generation stays."""
     for w in range(WORDS_MAX):
-        state.sum[w] = 0
+        state.total[w] = 0
     state.read_cell = 0
     state.read_phase = 0
     state.write_cell = 0
@@ -115,7 +115,7 @@ def scatter(params: Any, state: Any, memory: Any, cell: Any) -> None:
         else:
             for w in range(WORDS_MAX):
                 if w < words:
-                    state.sum[w] = int64(state.sum[w]) + int64(cell.learn[w])
+                    state.total[w] = int64(state.total[w]) + int64(cell.learn[w])
             state.write_phase = int64(state.write_phase) + 1
             if int64(state.write_phase) >= int64(params.decimation):
                 close_cell(params, state, memory)
@@ -131,11 +131,11 @@ def close_cell(params: Any, state: Any, memory: Any) -> None:
         read = int64(state.generation)
         for w in range(WORDS_MAX):
             if w < int64(params.words):
-                mean = divide_round(int64(state.sum[w]), ticks)
+                mean = divide_round(int64(state.total[w]), ticks)
                 before = int64(memory[read, here, w]) * scale
                 value = clamp(before + mean, int64(params.low[w]), int64(params.high[w]))
                 memory[1 - read, here, w] = divide_round(value, scale)
-                state.sum[w] = 0
+                state.total[w] = 0
         state.write_phase = 0
         state.write_cell = here + 1
 

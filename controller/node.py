@@ -91,10 +91,12 @@ def build(calibration: Calibration, memory_file: Path | None = None) -> Controll
     )
 
 
-def check_memory_file(calibration: Calibration, memory_file: Path) -> None:
-    """Raises store.MemoryFileError if there is such a file and `build` would refuse it."""
-    if memory_file.exists():
-        store.load(memory_file, calibration)
+def last_iteration(calibration: Calibration, memory_file: Path) -> int:
+    """Number of the last run that the memory file learned from, -1 if there is no file.
+
+    Raises store.MemoryFileError if `build` would refuse the file.
+    """
+    return store.load(memory_file, calibration).iteration if memory_file.exists() else -1
 
 
 def cycle(node: Controller, period: int) -> None:

@@ -1,7 +1,7 @@
 """Scenarios: one TOML file holds every number of a run; validated on loading, with one clear line for what is wrong.
 
 A scenario may stand on another: `base = "subway-paper"` takes that one's values and replaces what this file states. Found by
-name among the packaged scenarios, or as the path of a file.
+name among the packaged scenarios, or as the path of a file (a base's is relative to the file that names it).
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def _content(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
         raise ScenarioError(f"{path}: key `base`: expected the name of a scenario")
     if base:
         try:
-            below = find(base)
+            below = find(str(path.parent / base) if base.endswith(".toml") else base)
         except ScenarioError as error:
             raise ScenarioError(f"{path}: key `base`: {error}") from None
         content = _merged(_content(below, (*seen, path)), content)

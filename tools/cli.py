@@ -6,12 +6,15 @@ import os
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+if TYPE_CHECKING:
+    from plant_sim.scenario import Loaded
 
 app = typer.Typer(
     name="ato-hil",
@@ -59,12 +62,13 @@ COLUMNS = (
 class Screen:
     """Progress bar and table of a session; a plain line a run where there is no terminal."""
 
-    def __init__(self, runs: range, ticks: int) -> None:
-        self.runs, self.ticks = runs, ticks
+    def __init__(self, mode: Mode) -> None:
+        self.mode = mode
         self.rows: list[dict[str, Any]] = []
+        self.title = ""
         self.faults = 0
         self.bar = Progress(
-            TextColumn("run {task.fields[run]}/{task.fields[runs]}"),
+            TextColumn("run {task.fields[run]} of {task.fields[last_run]}"),
             BarColumn(),
             TextColumn("{task.percentage:>3.0f} %  {task.fields[rate]} ticks/s  {task.fields[last]}"),
             TimeElapsedColumn(),
@@ -72,7 +76,18 @@ class Screen:
             transient=True,
             disable=not console.is_terminal,
         )
-        self.task = self.bar.add_task("run", total=len(runs) * ticks, run=runs[0], runs=runs[-1], rate="-", last="")
+
+    def begin(self, loaded: Loaded, law: str, runs: range) -> None:
+        """Says what will be run."""
+        self.runs, self.ticks = runs, loaded.ticks
+        self.title = f"{loaded.name}, {law}, {self.mode.value}"
+        console.print(
+            f"{loaded.scenario.title}: law {law}, {len(runs)} runs of {loaded.ticks} ticks, {self.mode.value}",
+            soft_wrap=True,
+        )
+        self.task = self.bar.add_task(
+            "run", total=len(runs) * loaded.ticks, run=runs[0], last_run=runs[-1], rate="-", last=""
+        )
 
     def note(self, text: str) -> None:
         """One line above the bar."""
@@ -105,12 +120,14 @@ def _faults(row: dict[str, Any]) -> str:
     return ", ".join(row["faults"])
 
 
-def _print_table(title: str, rows: list[dict[str, Any]]) -> None:
-    table = Table(title=title, title_justify="left", header_style="bold")
+def _print_table(screen: Screen) -> None:
+    if not screen.rows or not console.is_terminal:
+        return
+    table = Table(title=screen.title, title_justify="left", header_style="bold")
     for name, _key, _factor, _text in COLUMNS:
         table.add_column(name, justify="right")
     table.add_column("faults")
-    for row in rows:
+    for row in screen.rows:
         table.add_row(*(_cell(row, key, f, s) for _n, key, f, s in COLUMNS), _faults(row))
     console.print(table)
 
@@ -140,10 +157,6 @@ def run(
         os.execve(sys.executable, [sys.executable, "-m", "tools.cli", *sys.argv[1:]], environment)
     try:
         _run(scenario, law, runs, mode, bus, seed, out, memory, trace)
-    except KeyboardInterrupt:
-        raise _fail("interrupted; the runs so far are kept", EXIT_INTERRUPTED) from None
-    except typer.Exit:
-        raise
     except ValueError as error:
         # Bad input of every kind (scenario, law, DBC, bus, memory file) is a ValueError of ours with one line.
         if type(error).__module__.split(".")[0] not in ("can_dbc", "controller", "plant_sim", "tools"):
@@ -162,33 +175,29 @@ def _run(
     memory: Path | None,
     trace: bool,
 ) -> None:
-    from controller.registry import load_law
     from plant_sim.scenario import load
     from tools import session
     from tools.hil import RunError
-    from tools.setup import run_numbers
 
     loaded = load(scenario)
-    law = law or loaded.scenario.law
-    count = runs or loaded.scenario.runs
-    load_law(law)
-    folder = out or Path("runs") / f"{loaded.name}-{law}-{mode.value}"
-    options = session.Options(scenario, law, count, mode.value, bus, seed, folder, memory, trace)
-    screen = Screen(run_numbers(law, count), loaded.ticks)
-    console.print(f"{loaded.scenario.title}: law {law}, {count} runs of {loaded.ticks} ticks, {mode.value}")
+    folder = out or Path("runs") / f"{loaded.name}-{law or loaded.scenario.law}-{mode.value}"
+    options = session.Options(scenario, law, runs, mode.value, bus, seed, folder, memory, trace)
+    screen = Screen(mode)
     try:
         with screen.bar:
             summary = session.run(options, screen)
     except RunError as error:
-        if screen.rows and console.is_terminal:
-            _print_table(f"{loaded.name}, {law}", screen.rows)
+        _print_table(screen)
         raise _fail(f"{error}; the runs so far are in {folder}", EXIT_ENDED_EARLY) from None
-    if console.is_terminal:
-        _print_table(f"{loaded.name}, {law}, {mode.value}", screen.rows)
-    console.print(f"digest {summary['digest']}")
+    except KeyboardInterrupt:
+        _print_table(screen)
+        raise _fail(f"interrupted; the runs so far are in {folder}", EXIT_INTERRUPTED) from None
+    _print_table(screen)
+    console.print(f"digest  {summary['digest']}")
     console.print(f"summary {folder / 'summary.json'}", soft_wrap=True)
     if trace:
-        console.print(f"trace   {folder / 'trace.rrd'}   (open it with: rerun {folder / 'trace.rrd'})", soft_wrap=True)
+        trace_file = folder / "trace.rrd"
+        console.print(f"trace   {trace_file}   (open it with: rerun {trace_file})", soft_wrap=True)
 
 
 @app.command("list")

@@ -44,9 +44,9 @@ from tools.frames import FRAME, Digest, columns
 from tools.trace import Reference, TraceWriter
 
 BATCH_TICKS = 1000  # of the trace
-# Frames gather while the recorder sleeps: it wakes 500 times a second instead of once a frame, and
+# Frames gather while the recorder sleeps: it wakes 200 times a second instead of once a frame, and
 # leaves the two cores to plant and controller.
-PAUSE_S = 0.002
+PAUSE_S = 0.005
 IDLE_S = 0.05  # longest wait for a frame, so that commands are heard
 SILENCE_S = 0.01  # at the end: the bus has nothing more
 DRAIN_S = 1.0  # at the end: longest wait for that

@@ -37,6 +37,9 @@ class SessionError(ValueError):
 class Listener(Protocol):
     """Who watches a session."""
 
+    def begin(self, loaded: Loaded, law: str, runs: range) -> None:
+        """The input is good; the runs with these numbers follow."""
+
     def note(self, text: str) -> None:
         """Something to know, once."""
 
@@ -83,14 +86,14 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     loaded = load(options.scenario)
     law = options.law or loaded.scenario.law
     load_law(law)
-    runs = options.runs or loaded.scenario.runs
-    if not 1 <= runs <= RUNS_MAX:
-        raise SessionError(f"{runs} runs, expected 1 to {RUNS_MAX}")
     calibration = setup.calibration_for(loaded, law)
-    if options.memory is not None:
-        node.check_memory_file(calibration, options.memory)
+    learned = -1 if options.memory is None else node.last_iteration(calibration, options.memory)
+    runs = setup.run_numbers(law, options.runs or loaded.scenario.runs, learned)
+    if runs[-1] > RUNS_MAX:
+        raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
     _prepare(options.out)
-    session = Session(options, loaded, law, setup.run_numbers(law, runs), listener)
+    listener.begin(loaded, law, runs)
+    session = Session(options, loaded, law, runs, listener)
     session.summary = {
         "schema": SCHEMA,
         "scenario": loaded.name,

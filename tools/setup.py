@@ -47,8 +47,11 @@ def _settings(key: str, values: dict[str, Any], kind: Any) -> Any:
         raise CalibrationError(f"{key}: {error}") from None
 
 
-def run_numbers(law: str, runs: int) -> range:
-    """Numbers of `runs` runs: from 1, after an initial run 0 for laws that learn from one (INITIAL_RUN in their file)."""
+def run_numbers(law: str, runs: int, learned: int = -1) -> range:
+    """Numbers of the next `runs` runs: on from the run that a memory file learned last (`learned`), else from 1, after
+    an initial run 0 for laws that learn from one (INITIAL_RUN in their file)."""
+    if learned >= 0:
+        return range(learned + 1, learned + 1 + runs)
     return range(0 if getattr(load_law(law), "INITIAL_RUN", False) else 1, runs + 1)
 
 

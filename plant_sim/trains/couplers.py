@@ -82,7 +82,7 @@ STATE = np.dtype(
         ("car_position_m", np.float64, (CARS_MAX,)),
         ("car_speed_m_s", np.float64, (CARS_MAX,)),
         ("section", np.int64, (CARS_MAX,)),
-        ("davis", np.float64, (2, 3)),  # a, b, c now
+        ("davis", np.float64, (2, 3)),  # a, b, c of this control period
         ("phase", OSCILLATOR, (2,)),
     ],
     align=True,
@@ -142,45 +142,45 @@ def fading(speed_m_s: Any, full_m_s: Any) -> Any:
 
 
 @step
-def resistance(params: Any, state: Any, car: Any, speed_m_s: Any, track_n_per_kn: Any) -> Any:
-    """R_k and W of one car, N, against its motion."""
-    kind = int64(params.kind[car])
-    a = state.davis[kind, 0]
-    b = state.davis[kind, 1]
-    c = state.davis[kind, 2]
-    basic = a * fading(speed_m_s, RESISTANCE_FULL_M_S) + speed_m_s * (b + c * abs(speed_m_s))
-    return params.weight_kn[car] * (basic + track_n_per_kn)
-
-
-@step
 def move(
     params: Any, track: Any, state: Any, actuator_params: Any, actuator: Any, disturbance_m_s2: Any
 ) -> None:
     """One integration step, from the front: a car moves when the tension behind it is known."""
     h = params.step_s
+    position = state.car_position_m
+    speed = state.car_speed_m_s
+    davis = state.davis
+    last = int64(params.cars) - 1
+    largest = state.coupler_force_n
+    work = 0.0
     ahead = 0.0
-    for k in range(params.cars):
-        x = state.car_position_m[k]
-        v = state.car_speed_m_s[k]
+    for k in range(last + 1):
+        x = position[k]
+        v = speed[k]
         behind = 0.0
-        if k + 1 < params.cars:
-            stretch = x - state.car_position_m[k + 1] - params.pitch_m
-            behind = params.stiffness_n_m * stretch + params.damping_n_s_m * (
-                v - state.car_speed_m_s[k + 1]
-            )
-            state.coupler_force_n = max(state.coupler_force_n, abs(behind))
+        if k < last:
+            stretch = x - position[k + 1] - params.pitch_m
+            behind = params.stiffness_n_m * stretch + params.damping_n_s_m * (v - speed[k + 1])
+            largest = max(largest, abs(behind))
         force = actuate(actuator_params, actuator, k)
         if force < 0.0:
             force *= fading(v, BRAKE_FULL_M_S)
+        kind = int64(params.kind[k])
         section = section_at(track, x, state.section[k])
         state.section[k] = section
-        against = resistance(params, state, k, v, track[section].resistance_n_per_kn)
-        pull = force - against + ahead - behind
+        resistance = params.weight_kn[k] * (
+            davis[kind, 0] * fading(v, RESISTANCE_FULL_M_S)
+            + v * (davis[kind, 1] + davis[kind, 2] * abs(v))
+            + track[section].resistance_n_per_kn
+        )
+        pull = force - resistance + ahead - behind
         v += h * (pull * params.inverse_mass[k] + disturbance_m_s2)
-        state.car_speed_m_s[k] = v
-        state.car_position_m[k] = x + h * v
-        state.traction_j += max(force, 0.0) * v * h
+        speed[k] = v
+        position[k] = x + h * v
+        work += max(force, 0.0) * v
         ahead = behind
+    state.coupler_force_n = largest
+    state.traction_j += h * work
 
 
 @step

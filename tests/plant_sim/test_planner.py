@@ -6,7 +6,7 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from plant_sim.planner import PlanError, ProfilePlan, Ramp, SpeedLimit, limit_at, plan_profile
@@ -423,6 +423,9 @@ def test_a_solved_speed_meets_the_distance(period_s, distance_m, shape):
 
 
 @given(change_m_s=st.floats(0.5, 20.0), shape=levels)
+@example(  # 334.01 ticks on paper, a little more in whole ones
+    change_m_s=0.8027068, shape={"acceleration_m_s2": 0.4, "jerk_m_s3": 0.3}
+)
 def test_a_ramp_may_end_with_the_run(change_m_s, shape):
     """It begins inside a tick and its pulses are no whole ticks: nothing may spill over the end."""
     plan = ProfilePlan(
@@ -439,6 +442,23 @@ def test_a_ramp_may_end_with_the_run(change_m_s, shape):
     assert (profile.v[-1], profile.a[-1]) == (0, 0)
     assert profile.v[-3] > 0
     assert profile.v[2] > 0
+
+
+def test_a_solved_speed_meets_the_distance_between_ramps_of_both_shapes():
+    plan = ProfilePlan(
+        duration_s=200.0,
+        distance_m=1500.0,
+        max_speed_m_s=20.0,
+        max_acceleration_m_s2=0.7,
+        max_jerk_m_s3=0.4,
+        ramps=(
+            Ramp(to_m_s="solved", start_s=1.0, acceleration_m_s2=0.7, jerk_m_s3=0.4),
+            Ramp(to_m_s=0.0, end_s=199.0, sinusoidal_s=60.0),
+        ),
+    )
+    profile = evaluate(plan_profile(plan, 0.01), 0.01)
+    assert profile.position_m[-1] == pytest.approx(1500.0, abs=1e-3)
+    assert (profile.v[-1], profile.a[-1]) == (0, 0)
 
 
 def test_a_train_may_stand_between_ramps():
@@ -642,8 +662,15 @@ def test_a_sinusoid_below_the_resolution_of_the_table_is_refused():
         plan_profile(plan, 0.001)
 
 
-def test_a_ramp_that_fills_the_run_without_a_tick_to_spare_is_refused():
-    """On paper it begins and ends on ticks; its pulses of 133.3 ticks do not fit whole ones."""
+@pytest.mark.parametrize(
+    ("first", "second", "number"),
+    [
+        ({"start_s": 0.0}, {"start_s": 10.0}, 2),
+        ({"end_s": 3.34}, {"start_s": 9.0}, 1),
+    ],
+)
+def test_a_ramp_without_a_tick_to_spare_is_refused(first, second, number):
+    """On paper it lasts 334 ticks from the first or to the last one; its pulses last 133.3."""
     shape = {"acceleration_m_s2": 0.4, "jerk_m_s3": 0.3}
     change_m_s = 0.4 * (2 + 1 / 150)
     plan = ProfilePlan(
@@ -652,11 +679,11 @@ def test_a_ramp_that_fills_the_run_without_a_tick_to_spare_is_refused():
         max_acceleration_m_s2=0.4,
         max_jerk_m_s3=0.3,
         ramps=(
-            Ramp(by_m_s=change_m_s, start_s=0.0, **shape),
-            Ramp(by_m_s=-change_m_s, start_s=10.0, **shape),
+            Ramp(by_m_s=change_m_s, **first, **shape),
+            Ramp(by_m_s=-change_m_s, **second, **shape),
         ),
     )
-    with pytest.raises(PlanError, match=r"^ramp 2 does not fit the run in whole ticks"):
+    with pytest.raises(PlanError, match=f"^ramp {number} does not fit the run in whole ticks"):
         plan_profile(plan, 0.01)
 
 

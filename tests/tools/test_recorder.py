@@ -246,16 +246,20 @@ def test_a_run_that_is_under_way_at_the_end_is_recorded(events) -> None:
     assert trace.calls[-1] == ("close",)
 
 
-def test_the_trace_gets_whole_ticks_while_the_run_goes_on(events) -> None:
+@pytest.mark.parametrize("run", [1, 2])
+def test_the_trace_gets_whole_ticks_while_a_run_goes_on(events, run: int) -> None:
     trace = Log()
     nodes = Nodes()
     recorder = Recorder(trace)  # type: ignore[arg-type]
-    frames = nodes.run(1, 2500)
+    if run == 2:
+        recorder.take([*nodes.run(1, 3000), nodes.control(ENDED, 1)])
+        trace.batches.clear()
+    frames = nodes.run(run, 2500)
     for start in range(0, len(frames), 37):
         recorder.take(frames[start : start + 37])
     assert len(trace.batches) == 2  # the run has not ended
-    recorder.take([nodes.control(ENDED, 1)])
-    assert [run for run, _ in trace.batches] == [1, 1, 1]
+    recorder.take([nodes.control(ENDED, run)])
+    assert [number for number, _ in trace.batches] == [run, run, run]
     for (_, before), (_, after) in pairwise(trace.batches):
         assert before["frame_id"][-1] == FORCE_CMD.frame_id
         assert after["tick"][0] == before["tick"][-1] + 1

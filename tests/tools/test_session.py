@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 SHORT = """
-base = "subway"
+base = "subway-fast"
 title = "A short run between two stops"
 runs = 2
 

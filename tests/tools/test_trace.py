@@ -253,14 +253,14 @@ def test_states_are_logged_by_name_where_they_change(tmp_path: Path) -> None:
     writer = open_writer(tmp_path / "trace.rrd")
     for start in range(0, len(rows), 2):  # a batch that begins with the same state adds nothing
         writer.frames(1, np.array(rows[start : start + 2], FRAME))
-    writer.frames(2, np.array(rows[:1], FRAME))
+    writer.frames(2, np.array(rows[5:], FRAME))  # begins as the run before ended
     writer.close()
     written = Trace(tmp_path / "trace.rrd")
     entity = "/bus/state/run_01/mode"
     assert written.ticks(entity) == [0, 2, 3, 5]
     states = written.column(entity, "StateChange:state")
     assert states == [["traction"], ["coast"], ["brake"], ["coast"]]
-    assert written.ticks("/bus/state/run_02/mode") == [0]
+    assert written.ticks("/bus/state/run_02/mode") == [5]
 
 
 def test_faults_are_spelled_out(tmp_path: Path) -> None:

@@ -1,0 +1,279 @@
+"""The learning memory against a model in plain Python."""
+
+import math
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from can_dbc.step import step
+from controller import memory
+from controller.memory import CELL, MEMORY_PARAMS, MEMORY_STATE, WORDS_MAX
+
+INT32 = st.integers(-(2**31), 2**31 - 1)
+
+
+@step
+def run_ticks(params: Any, state: Any, stored: Any, cell: Any, learn: Any, before: Any) -> None:
+    """One run: learn [ticks, words] goes in, before [ticks, words] comes out."""
+    memory.rewind(params[0], state[0])
+    for k in range(len(learn)):
+        memory.gather(params[0], state[0], stored, cell[0])
+        for w in range(learn.shape[1]):
+            before[k, w] = cell[0].before[w]
+            cell[0].learn[w] = learn[k, w]
+        memory.scatter(params[0], state[0], stored, cell[0])
+
+
+def settings_of(
+    words=1,
+    cells=1,
+    decimation=1,
+    lead=0,
+    linear=0,
+    scale=1,
+    low=-(2**31),
+    high=2**31 - 1,
+    initial=0,
+):
+    params = np.zeros(1, MEMORY_PARAMS)
+    params["words"], params["cells"], params["decimation"] = words, cells, decimation
+    params["lead"], params["linear"], params["scale"] = lead, linear, scale
+    params["weight"] = round(2**30 / (2 * decimation))
+    params["low"], params["high"], params["initial"] = low, high, initial
+    return params
+
+
+class Memory:
+    """The memory under test with its buffers."""
+
+    def __init__(self, params, dtype=np.int32):
+        self.params, self.state = params, np.zeros(1, MEMORY_STATE)
+        self.stored = memory.initial_memory(params[0], dtype)
+
+    def run(self, learn, keep=True):
+        learn = np.array(learn, np.int64).reshape(-1, int(self.params["words"][0]))
+        before = np.zeros(learn.shape, np.int64)
+        memory.start_run(self.state[0], self.stored)
+        run_ticks(self.params, self.state, self.stored, np.zeros(1, CELL), learn, before)
+        memory.end_run(self.params[0], self.state[0], self.stored, keep)
+        return before
+
+    @property
+    def values(self):
+        return self.stored[self.state["generation"][0]].tolist()
+
+
+@dataclass
+class Model:
+    """What the memory is to do, in exact numbers."""
+
+    decimation: int
+    lead: int
+    linear: bool
+    scale: int
+    low: list[int]
+    high: list[int]
+    cells: list[list[int]] = field(default_factory=list)
+
+    def before(self, tick, word):
+        """What is left for a tick; Fraction when interpolated."""
+        last = len(self.cells) - 1
+        here = min(tick // self.decimation, last)
+        if not self.linear:
+            return self.cells[here][word] * self.scale
+        # Straight lines between the centres of the cells, level beyond the first and the last.
+        place = Fraction(2 * tick + 1 - self.decimation, 2 * self.decimation)
+        left = min(max(math.floor(place), 0), last)
+        right = min(left + 1, last)
+        part = min(max(place - left, 0), 1)
+        a, b = self.cells[left][word], self.cells[right][word]
+        return (a + (b - a) * part) * self.scale
+
+    def learn(self, rows):
+        """The increments of a run that is kept."""
+        ticks = range(self.lead, len(rows))
+        cells = [list(cell) for cell in self.cells]
+        for index, cell in enumerate(cells):
+            mine = [rows[k] for k in ticks if (k - self.lead) // self.decimation == index]
+            for w in range(len(cell)):
+                if mine:
+                    mean = half_up(Fraction(sum(row[w] for row in mine), len(mine)))
+                    value = self.cells[index][w] * self.scale + mean
+                    value = min(max(value, self.low[w]), self.high[w])
+                    cell[w] = half_up(Fraction(value, self.scale))
+        self.cells = cells
+
+
+def half_up(value):
+    return math.floor(value + Fraction(1, 2))
+
+
+@st.composite
+def cases(draw):
+    """Settings, and the increments of three runs with whether each is kept."""
+    words = draw(st.integers(1, 3))
+    decimation = draw(st.integers(1, 6))
+    ticks = draw(st.integers(1, 40))
+    scale = draw(st.sampled_from([1, 2**16]))
+    bound = st.integers(-(2**15) + 1, 2**15 - 1).map(lambda value: value * 2**16)
+    low, high = zip(*(sorted(draw(st.tuples(bound, bound))) for _ in range(words)), strict=True)
+    case = {
+        "words": words,
+        "cells": -(-ticks // decimation),
+        "decimation": decimation,
+        "lead": draw(st.integers(0, 10)),
+        "linear": draw(st.booleans()),
+        "scale": scale,
+    }
+    value = INT32 | st.integers(-1000, 1000)
+    row = st.lists(value, min_size=words, max_size=words)
+    runs = [draw(st.lists(row, min_size=ticks, max_size=ticks)) for _ in range(3)]
+    kept = draw(st.lists(st.booleans(), min_size=3, max_size=3))
+    return case, list(low), list(high), runs, kept
+
+
+@settings(max_examples=200)
+@given(cases())
+def test_the_memory_is_the_model(drawn):
+    case, low, high, runs, kept = drawn
+    padded = [np.pad(bound, (0, WORDS_MAX - len(bound))) for bound in (low, high)]
+    params = settings_of(**case, low=padded[0], high=padded[1], initial=padded[0])
+    mine = Memory(params, np.int32 if case["scale"] == 1 else np.int16)
+    settings_kept = {name: case[name] for name in ("decimation", "lead", "linear", "scale")}
+    first = [value // case["scale"] for value in low]
+    model = Model(**settings_kept, low=low, high=high, cells=[first] * case["cells"])
+    for rows, keep in zip(runs, kept, strict=True):
+        found = mine.run(rows, keep)
+        for k, row in enumerate(found):
+            for w, value in enumerate(row):
+                exact = model.before(k, w)
+                # Interpolation rounds its weight to 2^-30 and its result to a stored unit.
+                allowed = (0.5 + 2**32 * case["decimation"] / 2**30) * case["scale"]
+                assert abs(value - exact) <= (allowed if case["linear"] else 0)
+        if keep:
+            model.learn(rows)
+        assert mine.values == model.cells
+
+
+# The same in single steps.
+
+
+def test_a_run_reads_what_the_last_one_left_and_not_what_it_writes():
+    mine = Memory(settings_of(cells=4, initial=100))
+    assert mine.run([1, 2, 3, 4]).ravel().tolist() == [100] * 4
+    assert mine.run([1, 1, 1, 1]).ravel().tolist() == [101, 102, 103, 104]
+    assert mine.values == [[102], [103], [104], [105]]
+
+
+def test_a_cell_takes_the_mean_of_its_ticks_once():
+    mine = Memory(settings_of(cells=3, decimation=4))
+    mine.run([1, 2, 3, 5, 7, 7, 7, 8, -1, -2, -3, -4])
+    assert mine.values == [[3], [7], [-2]]  # 2.75, 7.25, -2.5, half up
+
+
+def test_a_partial_last_cell_takes_the_mean_of_the_ticks_it_has():
+    mine = Memory(settings_of(cells=2, decimation=4))
+    mine.run([4, 4, 4, 4, 10, 20])
+    assert mine.values == [[4], [15]]
+
+
+def test_lead_stores_increments_earlier_than_they_were_measured():
+    mine = Memory(settings_of(cells=6, lead=2, initial=50))
+    mine.run([1, 2, 3, 4, 5, 6])
+    assert mine.values == [[53], [54], [55], [56], [50], [50]]
+
+
+def test_lead_and_decimation_together():
+    mine = Memory(settings_of(cells=3, decimation=2, lead=3))
+    mine.run([90, 91, 92, 3, 5, 10])
+    assert mine.values == [[4], [10], [0]]
+
+
+def test_hold_keeps_a_value_over_its_cell():
+    mine = Memory(settings_of(cells=2, decimation=3))
+    mine.run([3, 3, 3, 9, 9, 9])
+    assert mine.run([0] * 6).ravel().tolist() == [3, 3, 3, 9, 9, 9]
+
+
+def test_linear_meets_the_values_at_the_centres():
+    mine = Memory(settings_of(cells=3, decimation=4, linear=1))
+    mine.run([80] * 4 + [160] * 4 + [0] * 4)
+    expected = [80, 80, 90, 110, 130, 150, 140, 100, 60, 20, 0, 0]
+    assert mine.run([0] * 12).ravel().tolist() == expected
+
+
+def test_a_dropped_run_leaves_no_trace():
+    mine = Memory(settings_of(cells=3))
+    mine.run([1, 2, 3])
+    mine.run([70, 70, 70], keep=False)
+    assert mine.values == [[1], [2], [3]]
+    assert mine.run([0, 0, 0]).ravel().tolist() == [1, 2, 3]
+
+
+def test_a_run_that_ends_early_keeps_the_rest():
+    mine = Memory(settings_of(cells=4, initial=9))
+    mine.run([1, 1])
+    assert mine.values == [[10], [10], [9], [9]]
+
+
+def test_values_stay_between_their_bounds():
+    mine = Memory(settings_of(cells=2, low=-5, high=7))
+    mine.run([100, -100])
+    assert mine.values == [[7], [-5]]
+
+
+@pytest.mark.parametrize(("increment", "stored"), [(2**31 - 1, 2**15 - 1), (-(2**31), -(2**15))])
+def test_int16_saturates_and_never_wraps(increment, stored):
+    mine = Memory(settings_of(scale=2**16), np.int16)
+    mine.run([increment])
+    assert mine.values == [[stored]]
+
+
+def test_int16_starts_from_the_nearest_value():
+    mine = Memory(settings_of(scale=2**16, initial=3 * 2**16 - 1), np.int16)
+    assert mine.values == [[3]]
+
+
+def test_int16_takes_half_the_bytes():
+    params = settings_of(words=3, cells=10, scale=2**16)
+    assert Memory(params, np.int16).stored.nbytes * 2 == Memory(params).stored.nbytes == 240
+
+
+def test_a_law_without_words_uses_no_memory():
+    mine = Memory(settings_of(words=0, cells=0))
+    assert mine.stored.size == 0
+    cell = np.full(1, 7, np.int32).repeat(2 * WORDS_MAX).view(CELL)
+    memory.gather(mine.params[0], mine.state[0], mine.stored, cell[0])
+    memory.scatter(mine.params[0], mine.state[0], mine.stored, cell[0])
+    memory.end_run(mine.params[0], mine.state[0], mine.stored, True)
+    assert (cell["before"] == 7).all()
+    assert mine.state["generation"][0] == 0
+
+
+@given(
+    st.lists(INT32, min_size=4, max_size=4),
+    st.lists(INT32 | st.sampled_from([-(2**31), 2**31 - 1]), min_size=2, max_size=2),
+    st.sampled_from([(1, 0), (2, 0), (2, 1)]),
+)
+def test_no_value_overflows(interpreted, values, learned, grid):
+    decimation, linear = grid
+    params = settings_of(cells=2, decimation=decimation, linear=linear)
+    mine, checked = Memory(params), Memory(params)
+    for each in (mine, checked):
+        each.stored[:] = np.array(values).reshape(2, 2, 1)
+    cells = [np.zeros(1, CELL), np.zeros(1, CELL)]
+    for increment in learned:
+        memory.gather(params[0], mine.state[0], mine.stored, cells[0][0])
+        interpreted("controller.memory:gather", params, checked.state, checked.stored, cells[1])
+        for cell in cells:
+            cell["learn"][0, 0] = increment
+        memory.scatter(params[0], mine.state[0], mine.stored, cells[0][0])
+        interpreted("controller.memory:scatter", params, checked.state, checked.stored, cells[1])
+    assert cells[0] == cells[1]
+    assert (mine.stored == checked.stored).all()
+    assert mine.state == checked.state

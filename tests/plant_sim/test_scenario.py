@@ -1,0 +1,158 @@
+"""Scenarios: the packaged ones load, a base is inherited table by table, mistakes give one line."""
+
+import re
+import tomllib
+
+import pytest
+
+from plant_sim.scenario import FOLDER, ScenarioError, find, load, scenario_names
+from plant_sim.trains import couplers, lumped
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Writes a scenario file and gives its path as text."""
+
+    def write(text, name="mine.toml"):
+        path = tmp_path / name
+        path.write_text(text)
+        return str(path)
+
+    return write
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_a_packaged_scenario_loads(name):
+    loaded = load(name)
+    assert loaded.name == name
+    assert loaded.ticks == round(loaded.scenario.profile.duration_s / loaded.scenario.period_s) + 1
+    assert loaded.scenario.title
+
+
+def test_the_subway_scenarios_are_there():
+    wanted = {"subway", "subway-paper", "subway-fast", "subway-disturbed", "subway-stress"}
+    assert wanted <= set(scenario_names())
+
+
+def test_the_default_has_everything_on():
+    scenario = load("subway").scenario
+    assert isinstance(scenario.train, couplers.Train)
+    assert scenario.track.application == "smeared"
+    assert scenario.sensors.location == "mean"
+    actuators = scenario.actuator
+    lag_and_delay = actuators.lag_traction_s / scenario.period_s + actuators.delay_ticks
+    assert scenario.control.preview_ticks == round(lag_and_delay)
+    assert scenario.control.memory["lead_ticks"] == scenario.control.preview_ticks
+    assert scenario.laws["cailc"]["alpha"] == 2.0
+    assert scenario.laws["cailc"]["Gamma"] == [1e5, 1.0, 0.001]
+
+
+# Inheritance.
+
+
+def test_a_base_is_inherited_table_by_table_and_lists_are_replaced(write):
+    path = write('base = "subway-paper"\n[laws.cailc]\nalpha = 2.0\nGamma = [1.0, 2.0, 3.0]\n')
+    laws, paper = load(path).scenario.laws, load("subway-paper").scenario.laws
+    assert laws["cailc"] == paper["cailc"] | {"alpha": 2.0, "Gamma": [1.0, 2.0, 3.0]}
+    assert laws["pid"] == paper["pid"]
+
+
+def test_a_base_can_be_a_file_with_a_base(write):
+    write('base = "subway"\nruns = 3\n', "below.toml")
+    scenario = load(write('base = "below.toml"\ntitle = "above"\n')).scenario  # beside it
+    assert (scenario.title, scenario.runs) == ("above", 3)
+    assert isinstance(scenario.train, couplers.Train)
+
+
+def test_the_same_cars_serve_both_models(write):
+    path = write('base = "subway"\n[train]\nmodel = "lumped"\n')
+    train = load(path).scenario.train
+    assert isinstance(train, lumped.Train)
+    assert train.masses_kg == load("subway").scenario.train.masses_kg
+
+
+def test_the_digest_is_of_the_values(write):
+    plain = write('base = "subway-paper"\nruns = 3\nlaw = "ailc"\n', "plain.toml")
+    other = write('# a comment\nlaw = "ailc"\nbase   = "subway-paper"\nruns = 3\n', "other.toml")
+    changed = write('base = "subway-paper"\nruns = 4\nlaw = "ailc"\n', "changed.toml")
+    assert load(plain).digest == load(other).digest
+    assert load(plain).digest != load(changed).digest
+
+
+def test_the_digest_covers_what_is_inherited(write):
+    digests = set()
+    for runs in (3, 4):
+        below = write(f'base = "subway-paper"\nruns = {runs}\n', f"below{runs}.toml")
+        above = write(f'base = "{below}"\ntitle = "above"\n', f"above{runs}.toml")
+        digests.add(load(above).digest)
+    assert len(digests) == 2
+
+
+# Mistakes.
+
+MISTAKES = [
+    ("runs = [", r"not valid TOML: .*"),
+    ("base = 3", r"key `base`: expected the name of a scenario"),
+    ('base = "nowhere"', r"key `base`: scenario 'nowhere' is unknown, expected one of .*subway.*"),
+    ('base = "missing.toml"', r"key `base`: .*/missing\.toml: no such scenario file"),
+    ('title = "x"', r"Object missing required field `law`"),
+    ('base = "subway"\nrun = 3', r"Object contains unknown field `run`"),
+    ('base = "subway"\nruns = 0', r"key runs: 0, expected 1 or more"),
+    ('base = "subway"\nlaw = "bang-bang"', r"key law: 'bang-bang' has no gains, expected a table .*"),
+    ('base = "subway"\nperiod_s = 0.0', r"key period_s: Expected `float` > 0\.0"),
+    ('base = "subway"\nperiod_s = 0.03', r"\[profile\]: .*0\.03.*"),
+    ('base = "subway"\n[train]\nmodel = "maglev"', r"key train\.model: Invalid value 'maglev'"),
+    ('base = "subway"\n[train]\npitch_m = "long"', r"key train\.pitch_m: Expected `float`, got .*"),
+    ('base = "subway"\n[train]\nmotor_cars = [7]', r"key train: motor_cars: expected numbers .*"),
+    ('base = "subway-paper"\n[train]\nmodel = "couplers"', r"key train: coupler_stiffness_n_m.*"),
+    ('base = "subway"\n[control]\ndistribute = false', r"key control\.distribute: .*expected true"),
+    ('base = "subway"\n[track]\napplication = "point"', r"key track\.application: .*'smeared'"),
+    ('base = "subway"\n[track]\nfrom_m = [1.0]', r"key track: from_m and resistance_n_per_kn .*"),
+    ('base = "subway"\n[sensors]\nlocation = "rear"', r"key sensors: location is 'rear', .*"),
+    ('base = "subway"\n[sensors]\nspeed_noise_m_s = -1.0', r"key sensors\.speed_noise_m_s: .*>= 0.*"),
+    ('base = "subway"\n[sensors]\nspeed_step_m_s = nan', r"key sensors\.speed_step_m_s: .*>= 0.*"),
+    ('base = "subway"\n[disturbance]\nhold_ticks = 0', r"key disturbance\.hold_ticks: .*>= 1"),
+    ('base = "subway"\n[actuator]\ndelay_ticks = 16', r"key actuator: delay_ticks is 16, .*"),
+    ('base = "subway"\n[control]\nmass_error = 1.5', r"key control\.mass_error: .*<= 1.*"),
+    ('base = "subway"\n[control]\npreview_ticks = -1', r"key control\.preview_ticks: .*>= 0"),
+    ('base = "subway"\n[profile]\nlimits = []', r"key profile\.limits: expected at least one limit"),
+    ('base = "subway"\n[profile]\ndistance_m = 9e3', r"\[profile\]: distance_m = 9000 is out .*"),
+]
+
+
+@pytest.mark.parametrize(("text", "says"), MISTAKES, ids=[text for text, _ in MISTAKES])
+def test_a_mistake_gives_one_line_with_file_and_key(write, text, says):
+    path = write(text)
+    with pytest.raises(ScenarioError) as error:
+        load(path)
+    assert re.fullmatch(f"{re.escape(path)}: {says}", str(error.value))
+
+
+def test_a_base_that_leads_back_to_itself_is_refused(write):
+    path = write("", "loop.toml")
+    write(f'base = "{path}"', "loop.toml")
+    with pytest.raises(ScenarioError, match="key `base` leads back to itself"):
+        load(path)
+
+
+def test_an_unknown_name_lists_the_known_ones():
+    with pytest.raises(ScenarioError, match=r"'metro' is unknown, expected one of .*subway-paper"):
+        find("metro")
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path):
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(ScenarioError, match=r"folder\.toml: no such scenario file"):
+        load(str(tmp_path / "folder.toml"))
+
+
+def test_a_file_that_is_no_text_is_named(tmp_path):
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(ScenarioError, match=r"binary\.toml: not valid TOML"):
+        load(str(path))
+
+
+def test_every_packaged_scenario_says_what_it_is():
+    for path in FOLDER.glob("*.toml"):
+        assert "title" in tomllib.loads(path.read_text()), path
