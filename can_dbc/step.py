@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import operator
 import os
 from functools import lru_cache
 from pathlib import Path
@@ -41,8 +42,27 @@ def _checked_operator(name: str) -> Any:
     operation = getattr(int, name)
 
     def apply(self: int, other: Any) -> Any:
-        result = operation(self, int(other))
-        return result if result is NotImplemented else Checked(result)
+        try:
+            value = operator.index(other)
+        except TypeError:
+            return NotImplemented  # a float: the plant's business
+        return Checked(operation(self, value))
+
+    return apply
+
+
+def _checked_division(name: str) -> Any:
+    operation = getattr(int, name)
+    reflected = name.startswith("__r")
+
+    def apply(self: int, other: Any) -> Any:
+        try:
+            value = operator.index(other)
+        except TypeError:
+            return NotImplemented
+        # The compiled steps define x // 0 == 0 and x % 0 == 0.
+        divisor = int(self) if reflected else value
+        return Checked(0) if divisor == 0 else Checked(operation(self, value))
 
     return apply
 
@@ -50,25 +70,12 @@ def _checked_operator(name: str) -> Any:
 for _name in ("add", "sub", "mul", "and", "or", "xor", "lshift", "rshift"):
     setattr(Checked, f"__{_name}__", _checked_operator(f"__{_name}__"))
     setattr(Checked, f"__r{_name}__", _checked_operator(f"__r{_name}__"))
-for _name in ("neg", "abs", "invert"):
-    _unary = getattr(int, f"__{_name}__")
-    setattr(Checked, f"__{_name}__", lambda self, _unary=_unary: Checked(_unary(self)))
-
-
-def _checked_division(name: str) -> Any:
-    operation = getattr(int, name)
-
-    def apply(self: int, other: Any) -> Checked:
-        # The compiled steps define x // 0 == 0 and x % 0 == 0.
-        divisor = other if name.startswith("__r") is False else self
-        return Checked(0) if int(divisor) == 0 else Checked(operation(self, int(other)))
-
-    return apply
-
-
 for _name in ("floordiv", "mod"):
     setattr(Checked, f"__{_name}__", _checked_division(f"__{_name}__"))
     setattr(Checked, f"__r{_name}__", _checked_division(f"__r{_name}__"))
+for _name in ("neg", "pos", "abs", "invert"):
+    _unary = getattr(int, f"__{_name}__")
+    setattr(Checked, f"__{_name}__", lambda self, _unary=_unary: Checked(_unary(self)))
 
 int64: Any = Checked if INTERPRETED else numba.int64
 

@@ -158,7 +158,7 @@ def _announce(here: world.World, node: controller_node.Controller, run_state: in
 
 def commanded_force_n(frames: np.ndarray, ticks: int) -> np.ndarray:
     """Total force of FORCE_CMD by tick, N; a tick without the frame repeats the last."""
-    at, force = decode(frames, FORCE_CMD, "Force")
+    at, force = decode(frames[frames["tick"] < ticks], FORCE_CMD, "Force")
     latest = np.zeros(ticks, np.int64)
     latest[at] = np.arange(len(at))
     return force[np.maximum.accumulate(latest)] if len(at) else np.zeros(ticks)

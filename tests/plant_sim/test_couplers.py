@@ -1,4 +1,4 @@
-"""Cars with elastic couplers: Newton's laws, the modes of the chain, standstill, and the rigid limit."""
+"""Cars with elastic couplers: Newton's laws, the chain's modes, standstill, the rigid limit."""
 
 import msgspec
 import numpy as np
@@ -50,7 +50,7 @@ class Rig:
         couplers.reset(self.params[0]["train"], self.train)
 
     def run(self, force, periods, disturbance=0.0):
-        """Holds the cars' forces for some control periods; positions and speeds, [periods, cars]."""
+        """Holds the cars' forces for some periods; positions and speeds, [periods, cars]."""
         rows = np.zeros((2, periods, self.cars))
         train_params, actuator_params = self.params[0]["train"], self.params[0]["actuator"]
         state = self.state["actuator"][0]
@@ -222,9 +222,7 @@ def test_brake_and_resistance_also_oppose_rolling_back():
 
 def test_each_car_feels_the_track_at_its_own_place():
     # Only car 3 stands on the climb: 5 N/kN of its weight.
-    climb = Track(
-        application="smeared", from_m=[-45.0, -30.0], resistance_n_per_kn=[5.0, 0.0]
-    )
+    climb = Track(application="smeared", from_m=[-45.0, -30.0], resistance_n_per_kn=[5.0, 0.0])
     rig = Rig(track=climb, **SMOOTH)
     _, speeds = rig.run(np.zeros(6), 10)
     assert speeds[-1] @ MASSES == pytest.approx(-MASSES[2] * 9.81e-3 * 5.0 * 0.1, rel=1e-6)

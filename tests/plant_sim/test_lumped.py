@@ -181,9 +181,7 @@ def test_the_rear_follows_rigidly():
 def test_additional_resistance_is_the_sum_over_the_cars(smeared, places):
     rig = Rig(track=HILLS, smeared=smeared)
     for place in places:
-        found = lumped.additional_resistance(
-            rig.params[0]["train"], rig.track, rig.train, place
-        )
+        found = lumped.additional_resistance(rig.params[0]["train"], rig.track, rig.train, place)
         offsets = 19.5 * np.arange(6) * smeared
         index = np.searchsorted(HILLS.from_m, place - offsets, side="right")
         values = np.concatenate([[0.0], HILLS.resistance_n_per_kn])[index]

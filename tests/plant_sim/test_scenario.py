@@ -98,7 +98,10 @@ MISTAKES = [
     ('title = "x"', r"Object missing required field `law`"),
     ('base = "subway"\nrun = 3', r"Object contains unknown field `run`"),
     ('base = "subway"\nruns = 0', r"key runs: 0, expected 1 or more"),
-    ('base = "subway"\nlaw = "bang-bang"', r"key law: 'bang-bang' has no gains, expected a table .*"),
+    (
+        'base = "subway"\nlaw = "bang-bang"',
+        r"key law: 'bang-bang' has no gains, expected a table .*",
+    ),
     ('base = "subway"\nperiod_s = 0.0', r"key period_s: Expected `float` > 0\.0"),
     ('base = "subway"\nperiod_s = 0.03', r"\[profile\]: .*0\.03.*"),
     ('base = "subway"\n[train]\nmodel = "maglev"', r"key train\.model: Invalid value 'maglev'"),
@@ -109,13 +112,19 @@ MISTAKES = [
     ('base = "subway"\n[track]\napplication = "point"', r"key track\.application: .*'smeared'"),
     ('base = "subway"\n[track]\nfrom_m = [1.0]', r"key track: from_m and resistance_n_per_kn .*"),
     ('base = "subway"\n[sensors]\nlocation = "rear"', r"key sensors: location is 'rear', .*"),
-    ('base = "subway"\n[sensors]\nspeed_noise_m_s = -1.0', r"key sensors\.speed_noise_m_s: .*>= 0.*"),
+    (
+        'base = "subway"\n[sensors]\nspeed_noise_m_s = -1.0',
+        r"key sensors\.speed_noise_m_s: .*>= 0.*",
+    ),
     ('base = "subway"\n[sensors]\nspeed_step_m_s = nan', r"key sensors\.speed_step_m_s: .*>= 0.*"),
     ('base = "subway"\n[disturbance]\nhold_ticks = 0', r"key disturbance\.hold_ticks: .*>= 1"),
     ('base = "subway"\n[actuator]\ndelay_ticks = 16', r"key actuator: delay_ticks is 16, .*"),
     ('base = "subway"\n[control]\nmass_error = 1.5', r"key control\.mass_error: .*<= 1.*"),
     ('base = "subway"\n[control]\npreview_ticks = -1', r"key control\.preview_ticks: .*>= 0"),
-    ('base = "subway"\n[profile]\nlimits = []', r"key profile\.limits: expected at least one limit"),
+    (
+        'base = "subway"\n[profile]\nlimits = []',
+        r"key profile\.limits: expected at least one limit",
+    ),
     ('base = "subway"\n[profile]\ndistance_m = 9e3', r"\[profile\]: distance_m = 9000 is out .*"),
 ]
 

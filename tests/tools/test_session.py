@@ -196,7 +196,7 @@ def start_long_run(tmp_path: Path) -> subprocess.Popen[str]:
     deadline = time.monotonic() + 240
     while time.monotonic() < deadline:
         trace = tmp_path / "out" / "trace.rrd"
-        if trace.exists() and trace.stat().st_size > 1_000_000:
+        if trace.exists() and trace.stat().st_size > 4_000_000:
             return process
         assert process.poll() is None, process.communicate()
         time.sleep(0.1)

@@ -1,0 +1,324 @@
+"""From SI numbers to the firmware's parameters, and the file that is flashed."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from controller import calibration, distribution
+from controller.calibration import CalibrationError, GuardSettings, MemorySettings
+from controller.memory import initial_memory
+from controller.quantise import Vehicle, fixed
+from controller.reference import SEGMENT
+from controller.registry import LawError, law_names, law_number, load_law
+
+CAILC = {
+    "alpha": 8.0,
+    "beta": 1.1e5,
+    "Gamma": [100.0, 0.01, 0.01],
+    "nu_b": 0.1,
+    "r_max": 0.98,
+    "Xi_min": [-2000.0, 150.0, 6.0],
+    "Xi_max": [13000.0, 200.0, 9.0],
+    "Xi_initial": [2439.62458, 172.808613, 7.39949767],
+}
+PID = {"gp": 300201.0, "gI": 1.0, "gD": 10.0}
+PROFILE = np.array([(100, 0), (200, 300), (201, -300)], SEGMENT)  # 502 ticks with the last
+
+
+def calibrate(**changes):
+    settings = {
+        "law": "cailc",
+        "gains": CAILC,
+        "vehicle": Vehicle(194295.0, 0.01, 1.5),
+        "profile": PROFILE,
+        "preview_ticks": 0,
+        "memory_settings": MemorySettings(),
+        "guard_settings": GuardSettings(),
+        "car_effectiveness": [],
+        "motor_cars": [],
+        "scenario_digest": "d" * 32,
+    }
+    return calibration.calibrate(**settings | changes)
+
+
+def refusal(**changes):
+    with pytest.raises(CalibrationError) as error:
+        calibrate(**changes)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+# What the firmware gets.
+
+
+def test_the_parameters_hold_the_settings():
+    made = calibrate(
+        preview_ticks=21,
+        memory_settings=MemorySettings(decimation=10, lead_ticks=21, interpolation="linear"),
+        guard_settings=GuardSettings(age_max_ticks=7, service_brake_m_s2=0.5),
+    )
+    params = made.params[0]
+    assert (made.law, made.scenario_digest, made.memory_dtype) == ("cailc", "d" * 32, "int32")
+    assert params["core"]["mass"] == 194295 * 16
+    assert params["core"]["law"] == law_number("cailc") == 2
+    assert params["core"]["estimates"] == 5
+    assert params["core"]["exponent"].tolist() == [34, 39, 43, 24, 24, 0, 0, 0, 0, 0]
+    reference = params["reference"]
+    assert reference.tolist() == (300, 60_000, 3, 21)
+    guard = params["guard"]
+    assert (guard["age_max"], guard["control_age_max"]) == (7, 27)
+    assert guard["service_brake"] == -(2**26)
+    memory = params["memory"]
+    assert (memory["words"], memory["cells"], memory["decimation"]) == (3, 51, 10)
+    assert (memory["lead"], memory["linear"], memory["scale"]) == (21, 1, 1)
+    assert memory["weight"] == round(2**30 / 20)
+    assert memory["initial"][0] == round(2439.62458 / 194295.0 * 2**34)
+    assert params["distribution"]["cars"] == 0
+    assert (made.profile == PROFILE).all()
+
+
+def test_a_brake_is_a_brake_whatever_its_sign():
+    for value in (0.8, -0.8):
+        made = calibrate(guard_settings=GuardSettings(service_brake_m_s2=value))
+        assert made.params[0]["guard"]["service_brake"] == -round(0.8 * 2**27)
+
+
+def test_a_law_that_does_not_learn_has_no_memory():
+    made = calibrate(law="pid", gains=PID)
+    assert initial_memory(made.params[0]["memory"]).size == 0
+
+
+def test_int16_has_the_upper_half_of_a_word():
+    made = calibrate(memory_settings=MemorySettings(storage="int16"))
+    assert made.memory_dtype == "int16"
+    assert made.params[0]["memory"]["scale"] == 2**16
+
+
+def test_cars_get_their_distribution():
+    made = calibrate(car_effectiveness=[1.0, 0.5], motor_cars=[2])
+    assert made.params["distribution"] == distribution.calibrate([1.0, 0.5], [2])
+
+
+# What is refused.
+
+
+def test_an_unknown_law_is_named_with_those_there_are():
+    with pytest.raises(LawError) as error:
+        calibrate(law="pidd")
+    assert str(error.value) == f"law 'pidd' is unknown, expected one of {', '.join(law_names())}"
+    assert {"ailc", "adaptive", "cailc", "pdilc", "pid"} <= set(law_names())
+
+
+def without(key):
+    return {name: value for name, value in CAILC.items() if name != key}
+
+
+@pytest.mark.parametrize(
+    ("gains", "message"),
+    [
+        (without("alpha"), "laws.cailc: Object missing required field `alpha`"),
+        (
+            CAILC | {"aplha": 1.0},
+            "laws.cailc: Object contains unknown field `aplha`",
+        ),
+        (
+            CAILC | {"alpha": [1.0]},
+            "laws.cailc: Expected `float`, got `array` - at `$.alpha`",
+        ),
+        (
+            CAILC | {"alpha": "8"},
+            "laws.cailc: Expected `float`, got `str` - at `$.alpha`",
+        ),
+        (
+            CAILC | {"Gamma": [1.0, 2.0]},
+            "laws.cailc: Expected `array` of length 3, got 2 - at `$.Gamma`",
+        ),
+        (
+            CAILC | {"nu_b": 0.0},
+            "laws.cailc: Expected `float` > 0.0 - at `$.nu_b`",
+        ),
+        (
+            CAILC | {"r_max": 1.5},
+            "laws.cailc: Expected `float` <= 1.0 - at `$.r_max`",
+        ),
+        (
+            CAILC | {"beta": 1e9},
+            "laws.cailc: beta / M: 5146.81 is outside what the firmware holds, +-128",
+        ),
+        (
+            CAILC | {"Xi_initial": [1e5, 0.0, 0.0]},
+            "laws.cailc: Xi_initial[0] / M: 0.514681 is outside what the firmware holds, +-0.125",
+        ),
+        (
+            CAILC | {"alpha": math.nan},
+            "laws.cailc: alpha: nan is outside what the firmware holds, +-32768",
+        ),
+        (
+            CAILC | {"beta": math.inf},
+            "laws.cailc: beta / M: inf is outside what the firmware holds, +-128",
+        ),
+    ],
+)
+def test_wrong_gains_are_refused_with_their_key(gains, message):
+    assert refusal(gains=gains) == message
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"decimation": 0}, "control.memory.decimation is 0, expected 1 to 502"),
+        ({"lead_ticks": -1}, "control.memory.lead_ticks is -1, expected 0 to 502"),
+        (
+            {"interpolation": "cubic"},
+            "control.memory.interpolation is 'cubic', expected hold or linear",
+        ),
+        ({"storage": "int8"}, "control.memory.storage is 'int8', expected int32 or int16"),
+        ({"lead_ticks": 2**31}, "control.memory.lead_ticks is 2147483648, expected 0 to 502"),
+        ({"decimation": 2**40}, "control.memory.decimation is 1099511627776, expected 1 to 502"),
+    ],
+)
+def test_wrong_memory_settings_are_refused_with_their_key(settings, message):
+    assert refusal(memory_settings=MemorySettings(**settings)) == message
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"service_brake_m_s2": 20.0},
+            "control.guard.service_brake_m_s2: -20 is outside what the firmware holds, +-16",
+        ),
+        ({"age_max_ticks": 0}, "control.guard.age_max_ticks is 0, expected 1 to 1000"),
+        (
+            {"age_max_ticks": 2**40},
+            "control.guard.age_max_ticks is 1099511627776, expected 1 to 1000",
+        ),
+    ],
+)
+def test_wrong_guard_settings_are_refused_with_their_key(settings, message):
+    assert refusal(guard_settings=GuardSettings(**settings)) == message
+
+
+@pytest.mark.parametrize("preview", [-1, 129])
+def test_a_preview_that_the_firmware_has_not_is_refused(preview):
+    expected = f"control.preview_ticks is {preview}, expected 0 to 128"
+    assert refusal(preview_ticks=preview) == expected
+
+
+def test_a_period_that_the_reference_cannot_have_is_refused():
+    message = refusal(vehicle=Vehicle(194295.0, 0.03, 1.5))
+    assert message == "period_s is 0.03, expected one that divides 1 s"
+
+
+@pytest.mark.parametrize(
+    ("mass_kg", "message"),
+    [
+        (2e8, "mass_kg: 2e+08 is outside what the firmware holds, +-1.34218e+08"),
+        (0.0, "mass_kg is 0, expected more than 0"),
+    ],
+)
+def test_a_mass_that_does_not_fit_is_refused(mass_kg, message):
+    assert refusal(law="pid", gains=PID, vehicle=Vehicle(mass_kg, 0.01, 1.5)) == message
+
+
+def test_wrong_cars_are_refused():
+    message = refusal(car_effectiveness=[1.0, -1.0], motor_cars=[])
+    assert message == "train.effectiveness of car 2 is -1, expected 0 or 0.01 to 2"
+
+
+@pytest.mark.parametrize(
+    ("value", "q", "bits", "result"),
+    [
+        (0.5, 1, 32, 1),
+        (-2.0, 30, 32, -(2**31)),
+        (2.0 - 2.0**-30, 30, 32, 2**31 - 1),
+        (3.9999, 4, 7, 63.9984),
+    ],
+)
+def test_fixed_point_rounds_to_the_nearest(value, q, bits, result):
+    if result == round(result):
+        assert fixed("x", value, q, bits) == result
+    else:
+        with pytest.raises(CalibrationError, match=r"^x: 3.9999 is outside"):
+            fixed("x", value, q, bits)
+
+
+# The file.
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "flash.npz"
+    calibration.save(calibrate(preview_ticks=3), path)
+    return path
+
+
+def unreadable(path):
+    with pytest.raises(CalibrationError) as error:
+        calibration.load(path)
+    message = str(error.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message.removeprefix(f"{path}: ")
+
+
+def test_a_file_holds_the_calibration(path):
+    made, read = calibrate(preview_ticks=3), calibration.load(path)
+    assert read.params.tobytes() == made.params.tobytes()
+    assert read.profile.tobytes() == made.profile.tobytes()
+    assert (read.law, read.scenario_digest, read.memory_dtype) == ("cailc", "d" * 32, "int32")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    assert unreadable(tmp_path / "none").startswith("not a calibration file (")
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04 broken"])
+def test_other_content_is_refused(tmp_path, content):
+    path = tmp_path / "flash.npz"
+    path.write_bytes(content)
+    assert unreadable(path).startswith("not a calibration file (")
+
+
+def test_a_cut_file_is_refused(path):
+    whole = path.read_bytes()
+    for length in range(0, len(whole), 97):
+        path.write_bytes(whole[:length])
+        assert unreadable(path).startswith("not a calibration file (")
+
+
+def rewrite(path, **changes):
+    """The file with another head, params or profile."""
+    with np.load(path) as archive:
+        parts = dict(archive)
+    head = json.loads(parts["head"].tobytes()) | changes.pop("head", {})
+    parts["head"] = np.frombuffer(json.dumps(head).encode(), np.uint8)
+    np.savez(path, **parts | changes)
+
+
+def test_another_format_is_refused(path):
+    rewrite(path, head={"format": "ato-hil calibration 0"})
+    assert unreadable(path) == ("format 'ato-hil calibration 0', expected 'ato-hil calibration 1'")
+
+
+def test_parameters_of_another_build_are_refused(path):
+    rewrite(path, params=np.zeros(12, np.uint8))
+    assert unreadable(path) == "made for another build of law 'cailc'"
+
+
+def test_a_law_that_is_gone_is_named(path):
+    rewrite(path, head={"law": "gone"})
+    with pytest.raises(LawError, match=r"^law 'gone' is unknown"):
+        calibration.load(path)
+
+
+@pytest.mark.parametrize("name", ["ailc", "adaptive", "cailc", "pdilc", "pid"])
+def test_every_law_file_has_what_the_house_expects(name):
+    module = load_law(name)
+    assert module.PARAMS.isalignedstruct
+    assert module.STATE.isalignedstruct
+    assert len(module.ESTIMATES) <= 10
+    assert law_number(name) != 31
+    assert hasattr(module, "learned") == bool(module.WORDS)

@@ -1,0 +1,96 @@
+"""What a scenario becomes: the plant's parameters, and chance that seed and run alone decide."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from plant_sim import actuator, plant, world
+from plant_sim.scenario import load
+
+NOISE = "[sensors]\nspeed_noise_m_s = 0.005\n"
+LOAD = "[disturbance]\namplitude_m_s2 = 0.01\n"
+
+
+@pytest.fixture
+def variant(tmp_path):
+    """Loads `subway-paper` with something changed."""
+
+    def variant(text, name="mine"):
+        path = tmp_path / f"{name}.toml"
+        path.write_text(f'base = "subway-paper"\n{text}')
+        return load(str(path))
+
+    return variant
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(0, 4095))
+@settings(max_examples=20)
+def test_the_same_seed_and_run_give_the_same_numbers(seed, run):
+    loaded = load("subway")
+    first, second = (world.chance(loaded, seed, run) for _ in range(2))
+    assert first.tobytes() == second.tobytes()
+
+
+def test_seeds_and_runs_give_different_numbers():
+    loaded = load("subway")
+    drawn = [world.chance(loaded, seed, run) for seed in (1, 2) for run in (1, 2)]
+    for name in plant.CHANCE.names:
+        columns = np.array([rows[name] for rows in drawn])
+        correlation = np.corrcoef(columns) - np.eye(len(drawn))
+        assert abs(correlation).max() < 0.05
+
+
+def test_noise_and_load_are_independent_of_each_other(variant):
+    both = world.chance(variant(NOISE + LOAD, "both"), 1, 1)
+    noise = world.chance(variant(NOISE, "noise"), 1, 1)
+    disturbance = world.chance(variant(LOAD, "load"), 1, 1)
+    assert (both["speed_noise"] == noise["speed_noise"]).all()
+    assert (both["disturbance_m_s2"] == disturbance["disturbance_m_s2"]).all()
+    assert not noise["disturbance_m_s2"].any()
+    assert not disturbance["speed_noise"].any()
+    assert abs(np.corrcoef(both["speed_noise"], both["disturbance_m_s2"])[0, 1]) < 0.05
+
+
+def test_noise_is_white_with_unit_variance(variant):
+    loaded = variant(NOISE)
+    noise = np.concatenate([world.chance(loaded, 1, run)["speed_noise"] for run in range(10)])
+    count = len(noise)
+    assert abs(noise.mean()) < 4 / np.sqrt(count)
+    assert noise.var() == pytest.approx(1, abs=4 * np.sqrt(2 / count))
+    assert abs((noise[1:] * noise[:-1]).mean()) < 4 / np.sqrt(count)
+    within = np.mean(abs(noise) < 1)
+    assert within == pytest.approx(0.683, abs=0.01)  # a normal distribution's
+
+
+@pytest.mark.parametrize("hold", [1, 7, 100])
+def test_load_is_uniform_and_held(variant, hold):
+    loaded = variant(f"{LOAD}hold_ticks = {hold}\n", f"hold{hold}")
+    values = world.chance(loaded, 1, 1)["disturbance_m_s2"]
+    held = values[: len(values) // hold * hold].reshape(-1, hold)
+    assert (held == held[:, :1]).all()
+    assert len(np.unique(held[:, 0])) == len(held)
+    assert abs(values).max() <= 0.01
+    assert values.var() == pytest.approx(0.01**2 / 3, rel=0.2)
+
+
+def test_params_are_those_of_the_scenario():
+    here = world.build(load("subway"), 1)
+    node, actuators = here.params["node"][0], here.params["actuator"][0]
+    assert node["cars"] == 6
+    assert list(node["effectiveness"]) == [1.0, 0.5, 0.4, 0.6, 1.0, 0.5, 0.0, 0.0]
+    assert node["rear_weight"] == 0.5
+    assert node["rear_offset_m"] == 5 * 19.5
+    assert node["speed_noise_m_s"] == 0.005
+    assert actuators["delay"] == 1
+    assert actuators["slope"] == pytest.approx(194295.0 * 1.0 * 0.01)
+    assert actuators["traction_gain"] == pytest.approx(0.001 / 0.2)
+    assert here.limits["until_tick"].tolist() == [2500, 10000, 11000, 16000, 19000]
+    assert len(here.track) == 16
+
+
+def test_without_distribution_one_actuator_moves_the_train():
+    here = world.build(load("subway-paper"), 1)
+    assert here.params["node"]["cars"][0] == 0
+    assert here.params["node"]["rear_weight"][0] == 0
+    assert here.state["actuator"].dtype == actuator.STATE
