@@ -12,7 +12,8 @@ from typing import Any
 
 
 class Stop:
-    """Set by SIGTERM, or when the parent's end of stdin is closed: the node ends after the current tick."""
+    """Set by SIGTERM, or when the parent's end of stdin is closed: the node ends after the current
+    tick."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -25,7 +26,8 @@ class Stop:
 
 
 def follow_parent(on_command: Callable[[dict[str, Any]], None] | None = None) -> None:
-    """Reads commands, one JSON object a line, from stdin in a thread; the end of stdin ends this process."""
+    """Reads commands, one JSON object a line, from stdin in a thread; the end of stdin ends this
+    process."""
 
     def read() -> None:
         for line in sys.stdin:

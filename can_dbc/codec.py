@@ -1,8 +1,9 @@
 """The codec, derived from the DBC: cantools loads it, layouts become integer tables.
 
-Every frame is one 64-bit word: the eight payload bytes read little-endian as a signed integer (the mailbox word). All
-signals are little-endian, so a field is shift and mask on that word. `get` and `put` are steps: the same functions run
-in the firmware, in the plant and, interpreted, on checked integers. No second definition of a frame exists.
+Every frame is one 64-bit word: the eight payload bytes read little-endian as a signed integer (the
+mailbox word). All signals are little-endian, so a field is shift and mask on that word. `get` and
+`put` are steps: the same functions run in the firmware, in the plant and, interpreted, on checked
+integers. No second definition of a frame exists.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from can_dbc.step import dbc_path, int64, step
 
 HEADER = ("Crc", "Counter", "DataIdNibble")
 
-# The frames that the nodes exchange and the signals that they read or write. A node sends in this order, so the last
-# frame of each direction, TRAIN_POSITION and FORCE_CMD, closes its half of the tick.
+# The frames that the nodes exchange and the signals that they read or write. A node sends in this
+# order, so the last frame of each direction, TRAIN_POSITION and FORCE_CMD, closes its half of the
+# tick.
 NEEDED: dict[str, tuple[str, ...]] = {
     "RUN_CTRL": ("RunState", "Pace", "Iteration"),
     "ATP_LIMIT": ("PermittedSpeed", "TargetSpeed", "TargetDistance", "Supervision"),
@@ -71,7 +73,8 @@ def database() -> Database:
 
 
 def _message(index: int, name: str, needed: tuple[str, ...]) -> Any:
-    """Named tuple of one message: index, name, frame_id, data_id, cycle_ms and a Signal for each of its signals."""
+    """Named tuple of one message: index, name, frame_id, data_id, cycle_ms and a Signal for each
+    of its signals."""
     path = dbc_path()
     try:
         source = database().get_message_by_name(name)
@@ -86,7 +89,9 @@ def _message(index: int, name: str, needed: tuple[str, ...]) -> Any:
         if signal.byte_order != "little_endian":
             raise DbcError(f"{path}: {name}.{signal.name} must be little-endian")
         if signal.length > 32 or signal.is_float or signal.offset != 0:
-            raise DbcError(f"{path}: {name}.{signal.name} must be an integer of at most 32 bits, offset 0")
+            raise DbcError(
+                f"{path}: {name}.{signal.name} must be an integer of at most 32 bits, offset 0"
+            )
         signals[signal.name] = Signal(
             signal.start, signal.length, int(signal.is_signed), float(signal.scale)
         )
@@ -107,7 +112,7 @@ def _message(index: int, name: str, needed: tuple[str, ...]) -> Any:
         "cycle_ms": source.cycle_time or 0,
         **signals,
     }
-    return namedtuple(name, fields)(**fields)  # type: ignore[misc]
+    return namedtuple(name, fields)(**fields)
 
 
 MESSAGES: tuple[Any, ...] = tuple(
@@ -134,10 +139,9 @@ MESSAGES: tuple[Any, ...] = tuple(
 MESSAGE_COUNT = len(MESSAGES)
 INDEX_OF_FRAME_ID: dict[int, int] = {message.frame_id: message.index for message in MESSAGES}
 
-# One mailbox a message: the payload as a 64-bit word, and whether it arrived (or is to be sent) in this tick.
-MAILBOX = np.dtype(
-    [("payload", np.int64), ("fresh", np.int32), ("padding", np.int32)], align=True
-)
+# One mailbox a message: the payload as a 64-bit word, and whether it arrived (or is to be sent) in
+# this tick.
+MAILBOX = np.dtype([("payload", np.int64), ("fresh", np.int32), ("padding", np.int32)], align=True)
 
 
 def mailboxes() -> np.ndarray:
@@ -154,7 +158,8 @@ def choices(message: str, signal: str) -> dict[str, int]:
 
 
 def binary_exponent(message: Any, signal: str) -> int:
-    """n where the signal's scale is 2**-n: the firmware converts by shifts. Raises DbcError otherwise."""
+    """n where the signal's scale is 2**-n: the firmware converts by shifts. Raises DbcError
+    otherwise."""
     scale = getattr(message, signal).scale
     mantissa, exponent = np.frexp(scale)
     if mantissa != 0.5:
@@ -177,7 +182,8 @@ def get(word: int, signal: Signal) -> int:
 
 @step
 def put(signal: Signal, raw: int) -> int:
-    """The mailbox word with only this signal in it; add the words of several signals. `raw` must be in range."""
+    """The mailbox word with only this signal in it; add the words of several signals. `raw` must
+    be in range."""
     mask = (int64(1) << signal.length) - 1
     field = raw & mask
     if signal.start + signal.length == 64:

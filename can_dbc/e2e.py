@@ -1,10 +1,12 @@
 """AUTOSAR E2E Profile 11 in integers: CRC-8 and counter over the mailbox word.
 
-Byte 0 is the CRC, byte 1 the counter (low nibble, 0..14) and the Data-ID nibble (bits 8 to 11 of the Data-ID). The CRC
-is SAE J1850 (polynomial 0x1D) with initial value and final XOR 0, over the low byte of the Data-ID, a zero byte, and
-bytes 1 to 7 of the frame. Checked in the tests against the `autosar-e2e` package.
+Byte 0 is the CRC, byte 1 the counter (low nibble, 0..14) and the Data-ID nibble (bits 8 to 11 of
+the Data-ID). The CRC is SAE J1850 (polynomial 0x1D) with initial value and final XOR 0, over the
+low byte of the Data-ID, a zero byte, and bytes 1 to 7 of the frame. Checked in the tests against
+the `autosar-e2e` package.
 
-A CRC with initial value 0 is linear: it is the XOR of one table entry a byte, so all look-ups are independent.
+A CRC with initial value 0 is linear: it is the XOR of one table entry a byte, so all look-ups are
+independent.
 """
 
 from __future__ import annotations
@@ -67,7 +69,8 @@ def crc(word: Any, seed: Any) -> Any:
 
 @step
 def protect(word: Any, counter: Any, data_id: Any) -> Any:
-    """The word with header: CRC, counter (0..14) and Data-ID nibble. The two header bytes of `word` must be 0."""
+    """The word with header: CRC, counter (0..14) and Data-ID nibble. The two header bytes of
+    `word` must be 0."""
     headed = word + (counter << 8) + (((data_id >> 8) & 15) << 12)
     return headed + crc(headed, int64(_CRC_DATA_ID[data_id & 0xFF]))
 
@@ -80,7 +83,8 @@ def next_counter(counter: Any) -> Any:
 
 @step
 def check(word: Any, last_counter: Any, data_id: Any) -> Any:
-    """OK, REPEATED, LOST or CORRUPT; `last_counter` is that of the last good frame, -1 if there was none."""
+    """OK, REPEATED, LOST or CORRUPT; `last_counter` is that of the last good frame, -1 if there
+    was none."""
     found = word & 0xFF
     counter = (word >> 8) & 15
     nibble = (word >> 12) & 15

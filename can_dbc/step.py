@@ -1,12 +1,13 @@
 """`@step`: the one decorator of all code that runs as firmware or inside the cyclic loop.
 
-A step is compiled without the Python runtime: `_nrt=False` makes the compiler refuse whatever would allocate, so the
-allocation-free property is proved each time that a step compiles. The undecorated source runs in plain Python when
-ATO_HIL_INTERPRETED=1 is set before the import (the MIL mode): `int64` is then `Checked`, an integer that raises on the
-first value outside 64 bits, and a store outside its field's range raises OverflowError.
+A step is compiled without the Python runtime: `_nrt=False` makes the compiler refuse whatever
+would allocate, so the allocation-free property is proved each time that a step compiles. The
+undecorated source runs in plain Python when ATO_HIL_INTERPRETED=1 is set before the import (the
+MIL mode): `int64` is then `Checked`, an integer that raises on the first value outside 64 bits,
+and a store outside its field's range raises OverflowError.
 
-The compiler's cache is keyed by the sources of all four packages and the DBC, because numba itself sees an edit of the
-compiled file only, not of what that file imports.
+The compiler's cache is keyed by the sources of all four packages and the DBC, because numba itself
+sees an edit of the compiled file only, not of what that file imports.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import hashlib
 import inspect
 import operator
 import os
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,8 @@ _INT64_MAX = 2**63 - 1
 
 
 class Checked(int):
-    """An integer that stays inside 64 bits or raises OverflowError; what `int64` is in interpreted steps."""
+    """An integer that stays inside 64 bits or raises OverflowError; what `int64` is in interpreted
+    steps."""
 
     def __new__(cls, value: int) -> Checked:
         result = super().__new__(cls, value)
@@ -86,7 +88,7 @@ def dbc_path() -> Path:
     return Path(override) if override else Path(__file__).with_name("ato.dbc")
 
 
-@lru_cache(maxsize=None)
+@cache
 def _file_digest(path: str) -> str:
     try:
         return hashlib.blake2b(Path(path).read_bytes(), digest_size=12).hexdigest()
@@ -96,7 +98,8 @@ def _file_digest(path: str) -> str:
 
 @lru_cache(maxsize=1)
 def source_digest() -> str:
-    """Digest of every source that compiled code can depend on: the four packages, the DBC, the compiler."""
+    """Digest of every source that compiled code can depend on: the four packages, the DBC, the
+    compiler."""
     root = Path(__file__).resolve().parent.parent
     files = sorted(path for package in PACKAGES for path in (root / package).rglob("*.py"))
     parts = [f"{path.relative_to(root)}:{_file_digest(str(path))}" for path in files]
@@ -106,7 +109,8 @@ def source_digest() -> str:
 
 
 def cache_directory() -> Path:
-    """Where compiled steps are kept: NUMBA_CACHE_DIR, else a folder a source digest in the user's cache."""
+    """Where compiled steps are kept: NUMBA_CACHE_DIR, else a folder a source digest in the user's
+    cache."""
     configured = os.environ.get("NUMBA_CACHE_DIR")
     if configured:
         return Path(configured)
@@ -115,7 +119,8 @@ def cache_directory() -> Path:
 
 
 def _stable_identity(function: Any) -> str:
-    """A name that is equal in every process: numba's own is random, and closures over steps would miss the cache."""
+    """A name that is equal in every process: numba's own is random, and closures over steps would
+    miss the cache."""
     source = inspect.getsourcefile(function) or ""
     parts = [function.__module__, function.__qualname__, _file_digest(source)]
     for cell in function.__closure__ or ():

@@ -1,1 +1,2 @@
-"""The firmware: fixed-point laws, the cyclic task, learning memory, and the process that runs them."""
+"""The firmware: fixed-point laws, the cyclic task, learning memory, and the process that runs
+them."""

@@ -1,7 +1,9 @@
-"""Calibration: the SI numbers of a scenario become the integer parameters of the firmware, and a file that is flashed.
+"""Calibration: the SI numbers of a scenario become the integer parameters of the firmware, and a
+file that is flashed.
 
-The only float code of the firmware, together with `calibrate` of each law. A calibration file holds the law's name, the
-bytes of PARAMS and of the reference profile, and the scenario's digest; the controller process needs nothing else.
+The only float code of the firmware, together with `calibrate` of each law. A calibration file
+holds the law's name, the bytes of PARAMS and of the reference profile, and the scenario's digest;
+the controller process needs nothing else.
 """
 
 from __future__ import annotations
@@ -62,7 +64,8 @@ def calibrate(
     motor_cars: list[int],
     scenario_digest: str,
 ) -> Calibration:
-    """PARAMS of the firmware for one law on one scenario. Raises CalibrationError or LawError with one line."""
+    """PARAMS of the firmware for one law on one scenario. Raises CalibrationError or LawError with
+    one line."""
     module = load_law(law)
     try:
         typed = msgspec.convert(gains, module.Gains, strict=False)
@@ -123,7 +126,9 @@ def _memory(
     if settings.decimation < 1:
         raise CalibrationError(f"memory.decimation is {settings.decimation}, expected 1 or more")
     if settings.interpolation not in ("hold", "linear"):
-        raise CalibrationError(f"memory.interpolation is {settings.interpolation!r}, expected hold or linear")
+        raise CalibrationError(
+            f"memory.interpolation is {settings.interpolation!r}, expected hold or linear"
+        )
     if settings.storage not in ("int32", "int16"):
         raise CalibrationError(f"memory.storage is {settings.storage!r}, expected int32 or int16")
     initial, low, high = module.learned(gains, vehicle)
@@ -157,7 +162,8 @@ def save(calibration: Calibration, path: Path) -> None:
 
 
 def load(path: Path) -> Calibration:
-    """Reads a calibration file. Raises CalibrationError if it is none or is for another build of the law."""
+    """Reads a calibration file. Raises CalibrationError if it is none or is for another build of
+    the law."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             head = json.loads(archive["head"].tobytes())

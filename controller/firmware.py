@@ -1,10 +1,11 @@
 """The cyclic task: mailboxes in, mailboxes out, once a control period.
 
-Contract of `tick(params, profile, state, memory, rx, tx, period)`: a step. It reads `rx` (mailboxes, cleared by the caller after
-the tick), `params`, `profile`; writes `state`, `memory`, `tx`; takes bounded time; never raises, whatever is in the mailboxes.
-`period` is 1 when a control period has passed, 0 to look at RUN_CTRL alone.
-In order: decode and end-to-end check, ages, the onboard reference, the law, the guard, distribution over the cars, encode
-and protect. The process around it moves payloads and stores the learning memory, nothing else.
+Contract of `tick(params, profile, state, memory, rx, tx, period)`: a step. It reads `rx`
+(mailboxes, cleared by the caller after the tick), `params`, `profile`; writes `state`, `memory`,
+`tx`; takes bounded time; never raises, whatever is in the mailboxes. `period` is 1 when a control
+period has passed, 0 to look at RUN_CTRL alone. In order: decode and end-to-end check, ages, the
+onboard reference, the law, the guard, distribution over the cars, encode and protect. The process
+around it moves payloads and stores the learning memory, nothing else.
 """
 
 from __future__ import annotations
@@ -142,7 +143,8 @@ def state_dtype(law_state: np.dtype) -> np.dtype:
 
 @step
 def receive(link: Any, mailbox: Any, data_id: Any) -> Any:
-    """1 if the mailbox holds a new frame that passes the end-to-end check; keeps the link's counter and age."""
+    """1 if the mailbox holds a new frame that passes the end-to-end check; keeps the link's
+    counter and age."""
     link.age = min(int64(link.age) + 1, int64(1) << 20)
     if int64(mailbox.fresh) == 0:
         return int64(0)
@@ -169,7 +171,8 @@ def send(core: Any, tx: Any, message: Any, word: Any) -> None:
 
 @step
 def begin(params: Any, profile: Any, state: Any) -> None:
-    """State of a new run: reference at its start, counters at 0, no fault; the learning memory stays."""
+    """State of a new run: reference at its start, counters at 0, no fault; the learning memory
+    stays."""
     core = state.core
     core.tick = 0
     core.faults = 0
@@ -220,7 +223,8 @@ def tracking_word(inputs: Any) -> Any:
 
 @step
 def read_inputs(state: Any, rx: Any) -> None:
-    """Measurements, limit and tick from the mailboxes that pass their check; the others keep their last value."""
+    """Measurements, limit and tick from the mailboxes that pass their check; the others keep their
+    last value."""
     core = state.core
     inputs = state.inputs
     if receive(state.links[TRAIN_SPEED.index], rx[TRAIN_SPEED.index], TRAIN_SPEED.data_id):
@@ -298,10 +302,11 @@ def estimate_word(index: Any, exponent: Any, value: Any) -> Any:
 
 
 def build_tick(law_step: Any) -> Any:
-    """The cyclic task around one law, as a step `tick(params, profile, state, memory, rx, tx, period)`.
+    """The cyclic task around one law, as a step `tick(params, profile, state, memory, rx, tx,
+    period)`.
 
-    Shapes: params and state one record of `params_dtype`/`state_dtype`; profile [segments] of reference.SEGMENT; memory
-    [2, cells, words]; rx, tx [MESSAGE_COUNT] of codec.MAILBOX.
+    Shapes: params and state one record of `params_dtype`/`state_dtype`; profile [segments] of
+    reference.SEGMENT; memory [2, cells, words]; rx, tx [MESSAGE_COUNT] of codec.MAILBOX.
     """
 
     @step
@@ -385,7 +390,8 @@ def build_tick(law_step: Any) -> Any:
             word = int64(rx[RUN_CTRL.index].payload)
             wanted = get(word, RUN_CTRL.RunState)
             if wanted == RUNNING:
-                # A run starts only from armed: a controller that restarts inside a run stays silent.
+                # A run starts only from armed: a controller that restarts inside a run stays
+                # silent.
                 if int64(core.run_state) == ARMED:
                     core.run_state = RUNNING
             else:
@@ -399,4 +405,3 @@ def build_tick(law_step: Any) -> Any:
             run_tick(params, profile, state, cells, tx)
 
     return tick
-

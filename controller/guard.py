@@ -1,6 +1,7 @@
 """The guard: what may not happen whatever the law says. Integer comparisons that read as sentences.
 
-Contract: reads the checked inputs of this tick, limits the force, says why; never raises the force; bounded time.
+Contract: reads the checked inputs of this tick, limits the force, says why; never raises the
+force; bounded time.
 """
 
 from __future__ import annotations
@@ -35,7 +36,12 @@ PARAMS = np.dtype(
 
 # Why the run may not go on as the law wants: brake until the run ends.
 FAULTS_THAT_BRAKE = (
-    FAULT_SPEED_LOST | FAULT_POSITION_LOST | FAULT_LIMIT_LOST | FAULT_CONTROL_LOST | FAULT_SENSOR | FAULT_ATP
+    FAULT_SPEED_LOST
+    | FAULT_POSITION_LOST
+    | FAULT_LIMIT_LOST
+    | FAULT_CONTROL_LOST
+    | FAULT_SENSOR
+    | FAULT_ATP
 )
 
 

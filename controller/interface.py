@@ -1,4 +1,5 @@
-"""What every law reads and writes, and what the firmware reports: the records shared by all laws."""
+"""What every law reads and writes, and what the firmware reports: the records shared by all
+laws."""
 
 from __future__ import annotations
 
@@ -30,7 +31,11 @@ OUTPUTS = np.dtype(
     [
         ("force", np.int32),  # specific force, m/s^2 (N/kg), Q27, traction positive
         ("status", np.int32),  # bits of FAULTS that the law itself reports
-        ("estimate", np.int32, (ESTIMATES_MAX,)),  # for the traces; Q formats in the law's ESTIMATES
+        (
+            "estimate",
+            np.int32,
+            (ESTIMATES_MAX,),
+        ),  # for the traces; Q formats in the law's ESTIMATES
     ],
     align=True,
 )
@@ -67,7 +72,8 @@ FAULTS: dict[int, str] = {
     FAULT_BARRIER: "barrier reached",
 }
 
-# A run with one of these leaves no trace in the learning memory; a law that reaches its barrier still learns from it.
+# A run with one of these leaves no trace in the learning memory; a law that reaches its barrier
+# still learns from it.
 FAULTS_THAT_BLOCK_LEARNING = sum(FAULTS) - FAULT_BARRIER
 
 

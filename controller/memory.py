@@ -1,13 +1,15 @@
 """Learning memory: what one run leaves for the next, on a grid of `decimation` control periods.
 
-An array [2, cells, words] of int32 (or int16): one generation is read while the other is written, so that a run in which
-a fault occurred is dropped whole, and linear interpolation never reads what this run has just written. For every tick the
-memory gathers `before[w]` (what the previous runs left for this tick) for the law, and takes `learn[w]` from it. The increment
-of a cell is the mean of `learn` over the cell's ticks, added once to what the cell held, and clamped; it is stored `lead`
-ticks earlier than it was measured, which is what keeps learning stable when the actuator lags.
+An array [2, cells, words] of int32 (or int16): one generation is read while the other is written,
+so that a run in which a fault occurred is dropped whole, and linear interpolation never reads what
+this run has just written. For every tick the memory gathers `before[w]` (what the previous runs
+left for this tick) for the law, and takes `learn[w]` from it. The increment of a cell is the mean
+of `learn` over the cell's ticks, added once to what the cell held, and clamped; it is stored
+`lead` ticks earlier than it was measured, which is what keeps learning stable when the actuator
+lags.
 
-Contract: `gather` and `scatter` are steps of bounded time that run inside the tick; `start_run`, `end_run` run between
-runs. The caller owns every buffer.
+Contract: `gather` and `scatter` are steps of bounded time that run inside the tick; `start_run`,
+`end_run` run between runs. The caller owns every buffer.
 """
 
 from __future__ import annotations
@@ -82,7 +84,8 @@ def gather(params: Any, state: Any, memory: Any, cell: Any) -> None:
         here = int64(state.read_cell)
         phase = int64(state.read_phase)
         last = int64(params.cells) - 1
-        # Distance from the cell's centre in half ticks; the neighbour on that side has the weight |offset| / (2 D).
+        # Distance from the cell's centre in half ticks; the neighbour on that side has the weight
+        # |offset| / (2 D).
         offset = 2 * phase - (decimation - 1)
         neighbour = here
         if int64(params.linear) == 1:
@@ -123,7 +126,8 @@ def scatter(params: Any, state: Any, memory: Any, cell: Any) -> None:
 
 @step
 def close_cell(params: Any, state: Any, memory: Any) -> None:
-    """Adds the mean increment of the open cell to its value in the generation that is written; opens the next."""
+    """Adds the mean increment of the open cell to its value in the generation that is written;
+    opens the next."""
     ticks = int64(state.write_phase)
     here = int64(state.write_cell)
     if ticks > 0 and here < int64(params.cells):
@@ -131,10 +135,11 @@ def close_cell(params: Any, state: Any, memory: Any) -> None:
         read = int64(state.generation)
         for w in range(WORDS_MAX):
             if w < int64(params.words):
-                mean = divide_round(int64(state.total[w]), ticks)
+                total = int64(state.total[w])
+                mean = total if ticks == 1 else divide_round(total, ticks)
                 before = int64(memory[read, here, w]) * scale
                 value = clamp(before + mean, int64(params.low[w]), int64(params.high[w]))
-                memory[1 - read, here, w] = divide_round(value, scale)
+                memory[1 - read, here, w] = value if scale == 1 else divide_round(value, scale)
                 state.total[w] = 0
         state.write_phase = 0
         state.write_cell = here + 1
@@ -143,19 +148,21 @@ def close_cell(params: Any, state: Any, memory: Any) -> None:
 def initial_memory(params: np.void, dtype: type = np.int32) -> np.ndarray:
     """Memory [2, cells, words] before the first run, all cells at `initial`."""
     cells, words = int(params["cells"]), int(params["words"])
-    memory = np.zeros((2, cells, words), dtype)
+    memory: np.ndarray = np.zeros((2, cells, words), dtype)
     memory[:] = params["initial"][:words] // int(params["scale"])
     return memory
 
 
 def start_run(state: np.void, memory: np.ndarray) -> None:
-    """The generation that will be written starts as a copy: cells that this run does not reach keep their value."""
+    """The generation that will be written starts as a copy: cells that this run does not reach
+    keep their value."""
     read = int(state["generation"])
     memory[1 - read] = memory[read]
 
 
 def end_run(params: np.void, state: np.void, memory: np.ndarray, keep: bool) -> None:
-    """Closes the open cell with the ticks that it had and, if the run is kept, makes it the one that is read."""
+    """Closes the open cell with the ticks that it had and, if the run is kept, makes it the one
+    that is read."""
     if int(params["words"]) == 0:
         return
     close_cell(params, state, memory)

@@ -1,6 +1,7 @@
 """A controller ready to run: the compiled tick with its buffers, and what happens between runs.
 
-The same object serves the controller process (HIL), the single-process loop (SIL) and the interpreted run (MIL).
+The same object serves the controller process (HIL), the single-process loop (SIL) and the
+interpreted run (MIL).
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ def rows(array: np.ndarray) -> Any:
 
 
 def callable_tick(tick: Any) -> Any:
-    """`tick` for Python. Arrays are ten times cheaper to pass than records: a record is described field by field."""
+    """`tick` for Python. Arrays are ten times cheaper to pass than records: a record is described
+    field by field."""
 
     @step
     def call(
@@ -100,7 +102,8 @@ def last_iteration(calibration: Calibration, memory_file: Path) -> int:
 
 
 def cycle(node: Controller, period: int) -> None:
-    """One tick (`period` as in firmware.tick), then what a change of the run state asks for: a run starts or ends its learning.
+    """One tick (`period` as in firmware.tick), then what a change of the run state asks for: a run
+    starts or ends its learning.
 
     The memory is stored before the caller sends `tx`, so that ATO_STATUS(ended) says that it is.
     """

@@ -1,7 +1,9 @@
-"""The controller process: payloads from the bus into the mailboxes, a tick, payloads from the mailboxes to the bus.
+"""The controller process: payloads from the bus into the mailboxes, a tick, payloads from the
+mailboxes to the bus.
 
-Started with a calibration file; knows nothing of the plant. TRAIN_POSITION, the plant's last frame of a tick, starts the
-control period; a RUN_CTRL that arms or ends a run is answered at once. Internal: `ato-hil run` starts it.
+Started with a calibration file; knows nothing of the plant. TRAIN_POSITION, the plant's last frame
+of a tick, starts the control period; a RUN_CTRL that arms or ends a run is answered at once.
+Internal: `ato-hil run` starts it.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
 """Fixed-point arithmetic of the firmware: int32 storage, int64 intermediates, nothing wraps.
 
-Contract: every function is a step (allocation-free, integer-only, bounded time). Right shifts round half up. A store is
-always preceded by `sat32` or a clip to the physical range. Division by zero has a defined result (0).
+Contract: every function is a step (allocation-free, integer-only, bounded time). Right shifts
+round half up. A store is always preceded by `sat32` or a clip to the physical range. Division by
+zero has a defined result (0).
 
-One Q format a quantity at the interfaces of the firmware, in the table below; a law may be finer inside and says why.
+One Q format a quantity at the interfaces of the firmware, in the table below; a law may be finer
+inside and says why.
 """
 
 from __future__ import annotations
@@ -38,17 +40,20 @@ def sat32(value: Any) -> Any:
 
 @step
 def round_shift(value: Any, bits: Any) -> Any:
-    """value / 2**bits, rounded half up; bits 1..62, constant at the call; |value| < 2**63 - 2**(bits-1)."""
+    """value / 2**bits, rounded half up; bits 1..62, constant at the call; |value| < 2**63 -
+    2**(bits-1)."""
     return (value + (int64(1) << (bits - 1))) >> bits
 
 
 @step
 def divide_round(numerator: Any, denominator: Any) -> Any:
-    """numerator / denominator rounded half up, denominator > 0; 0 if the denominator is 0. |numerator| < 2**62."""
+    """numerator / denominator rounded half up, denominator > 0; 0 if the denominator is 0.
+    |numerator| < 2**62."""
     return (2 * numerator + denominator) // (2 * denominator)
 
 
-# sin(pi/2 s) / s on (0, 1] as an odd minimax polynomial in s, Q28: relative error 1.1e-6 (Q30 result, s in Q30).
+# sin(pi/2 s) / s on (0, 1] as an odd minimax polynomial in s, Q28: relative error 1.1e-6 (Q30
+# result, s in Q30).
 _SIN_1 = round(1.5707956 * 2**28)
 _SIN_3 = round(-0.64592791 * 2**28)
 _SIN_5 = round(0.07950217 * 2**28)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 
 class CalibrationError(ValueError):
-    """A number of the scenario has no integer form; the message names the key, the value and the range."""
+    """A number of the scenario has no integer form; the message names the key, the value and the
+    range."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,8 @@ class Vehicle:
 
 
 def fixed(key: str, value: float, q: int, bits: int = 32) -> int:
-    """`value` in units of 2**-q as a signed integer of `bits`; raises CalibrationError if it does not fit."""
+    """`value` in units of 2**-q as a signed integer of `bits`; raises CalibrationError if it does
+    not fit."""
     scaled = round(value * 2.0**q)
     if not -(2 ** (bits - 1)) <= scaled < 2 ** (bits - 1):
         limit = 2.0 ** (bits - 1 - q)

@@ -1,10 +1,12 @@
 """The onboard reference: a table of constant-jerk segments, integrated exactly in integers.
 
-Units: position 2**-40 m; with the control period Ts, acceleration 6 * 2**-40 / Ts^2 and speed 3 * 2**-40 / Ts, so that one
-tick of constant jerk is the exact recursion x += 3 v + 3 a + J, v += 2 a + J, a += J (old values on the right). The
-profile takes eight bytes a segment, and firmware, plant and reports agree to the bit.
+Units: position 2**-40 m; with the control period Ts, acceleration 6 * 2**-40 / Ts^2 and speed 3 *
+2**-40 / Ts, so that one tick of constant jerk is the exact recursion x += 3 v + 3 a + J, v += 2 a
++ J, a += J (old values on the right). The profile takes eight bytes a segment, and firmware, plant
+and reports agree to the bit.
 
-Contract: `advance` moves a cursor by one tick in bounded time; past the last segment the cursor stays where it is.
+Contract: `advance` moves a cursor by one tick in bounded time; past the last segment the cursor
+stays where it is.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The learning memory on disk: a header, the cells, a CRC-32 over all.
 
-Written to a temporary file, fsynced and renamed; the last good generation is kept as FILE.previous. A file that does not
-match the law and the scenario, or does not verify, is refused with one line, never half used.
+Written to a temporary file, fsynced and renamed; the last good generation is kept as
+FILE.previous. A file that does not match the law and the scenario, or does not verify, is refused
+with one line, never half used.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ _HEADER = struct.Struct("<8sIIIII32s64s")
 
 
 class MemoryFileError(ValueError):
-    """The file is no learning memory for this law and scenario; the message names file and reason."""
+    """The file is no learning memory for this law and scenario; the message names file and
+    reason."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,9 @@ def load(path: Path, calibration: Calibration) -> Stored:
         raise MemoryFileError(f"{path}: not a learning memory of ato-hil")
     body, (crc,) = content[:-4], struct.unpack("<I", content[-4:])
     if zlib.crc32(body) != crc:
-        raise MemoryFileError(f"{path}: damaged (CRC-32 does not match); {path}.previous may be whole")
+        raise MemoryFileError(
+            f"{path}: damaged (CRC-32 does not match); {path}.previous may be whole"
+        )
     _, version, iteration, cells, words, width, law_bytes, digest_bytes = _HEADER.unpack_from(body)
     law = law_bytes.rstrip(b"\0").decode(errors="replace")
     digest = digest_bytes.rstrip(b"\0").decode(errors="replace")
@@ -85,11 +89,15 @@ def load(path: Path, calibration: Calibration) -> Stored:
     if law != calibration.law:
         raise MemoryFileError(f"{path}: learned by law {law!r}, expected {calibration.law!r}")
     if digest != calibration.scenario_digest:
-        raise MemoryFileError(f"{path}: learned on another scenario (digest {digest}, expected {calibration.scenario_digest})")
+        raise MemoryFileError(
+            f"{path}: learned on another scenario"
+            f" (digest {digest}, expected {calibration.scenario_digest})"
+        )
     dtype = np.dtype(calibration.memory_dtype)
     if (cells, words) != shape or width != dtype.itemsize:
         raise MemoryFileError(
-            f"{path}: {cells} cells of {words} words of {width} bytes, expected {shape[0]} of {shape[1]} of {dtype.itemsize}"
+            f"{path}: {cells} cells of {words} words of {width} bytes,"
+            f" expected {shape[0]} of {shape[1]} of {dtype.itemsize}"
         )
     data = np.frombuffer(body, dtype, cells * words, _HEADER.size).reshape(cells, words)
     return Stored(data.copy(), iteration)

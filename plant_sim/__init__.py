@@ -1,1 +1,2 @@
-"""The world: train dynamics, track, sensors, actuators, ATP, scenarios, and the process that runs them."""
+"""The world: train dynamics, track, sensors, actuators, ATP, scenarios, and the process that runs
+them."""

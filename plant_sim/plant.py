@@ -1,7 +1,9 @@
-"""The plant as a node: sensors and ATP to frames, frames to actuators, one control period at a time.
+"""The plant as a node: sensors and ATP to frames, frames to actuators, one control period at a
+time.
 
-`sense` writes the frames of tick k, `actuate_and_advance` takes the answers and moves the train to tick k + 1. Both are steps: the
-plant process (HIL) and the single-process loop (SIL) run the same code and send the same bits.
+`sense` writes the frames of tick k, `actuate_and_advance` takes the answers and moves the train to
+tick k + 1. Both are steps: the plant process (HIL) and the single-process loop (SIL) run the same
+code and send the same bits.
 """
 
 from __future__ import annotations
@@ -79,7 +81,11 @@ NODE_STATE = np.dtype(
         ("tick", np.int64),
         ("limit", np.int64),  # index of the limit in force
         ("permitted_speed_m_s", np.float64),
-        ("command_n", np.float64, (CARS_MAX,)),  # last valid command: channel 0 the total, or each car
+        (
+            "command_n",
+            np.float64,
+            (CARS_MAX,),
+        ),  # last valid command: channel 0 the total, or each car
         ("refused", np.int64),  # frames that failed the end-to-end check
         ("sent", np.int64, (MESSAGE_COUNT,)),  # next end-to-end counter
         ("received", np.int64, (MESSAGE_COUNT,)),  # last end-to-end counter, -1: none
@@ -185,11 +191,11 @@ def raw_of(signal: Any, value: Any) -> Any:
 
 @step
 def read_commands(params: Any, node: Any, rx: Any) -> None:
-    """command_n from the frames that pass their check; a missing or refused one keeps the last value."""
-    if params.cars == 0:
-        if received(node, rx, FORCE_CMD):
-            raw = get(int64(rx[FORCE_CMD.index].payload), FORCE_CMD.Force)
-            node.command_n[0] = raw * FORCE_CMD.Force.scale
+    """command_n from the frames that pass their check; a missing or refused one keeps the last
+    value."""
+    if params.cars == 0 and received(node, rx, FORCE_CMD):
+        raw = get(int64(rx[FORCE_CMD.index].payload), FORCE_CMD.Force)
+        node.command_n[0] = raw * FORCE_CMD.Force.scale
     if params.cars > 0 and received(node, rx, CAR_FORCE_1):
         word = int64(rx[CAR_FORCE_1.index].payload)
         node.command_n[0] = get(word, CAR_FORCE_1.Car1) * CAR_FORCE_1.Car1.scale
@@ -215,11 +221,12 @@ def no_coupler_force_n(train: Any) -> Any:
 
 
 def build(model: Any) -> tuple[Any, Any, Any]:
-    """Steps around one train model: `begin(params, state)`, `sense(params, limits, state, chance, tx)` and
-    `actuate_and_advance(params, track, state, chance, rx, truth)`.
+    """Steps around one train model: `begin(params, state)`, `sense(params, limits, state, chance,
+    tx)` and `actuate_and_advance(params, track, state, chance, rx, truth)`.
 
-    Shapes: params, state one record of `params_dtype`/`state_dtype`; limits [n] of LIMIT; track [n] of track.SECTION; chance,
-    truth one record of CHANCE, TRUTH of this tick; rx, tx [MESSAGE_COUNT] of codec.MAILBOX.
+    Shapes: params, state one record of `params_dtype`/`state_dtype`; limits [n] of LIMIT; track
+    [n] of track.SECTION; chance, truth one record of CHANCE, TRUTH of this tick; rx, tx
+    [MESSAGE_COUNT] of codec.MAILBOX.
     """
     reset_train = model.reset
     advance_train = model.advance

@@ -1,7 +1,8 @@
 """The plant process: senses, sends, waits for the controller's answer, moves the train; lockstep.
 
-The plant sends the frames of tick k and moves the train only after FORCE_CMD has echoed tick k. A missing answer ends the run with
-an error that names the silent node; what was recorded so far is kept. Internal: `ato-hil run` starts it.
+The plant sends the frames of tick k and moves the train only after FORCE_CMD has echoed tick k. A
+missing answer ends the run with an error that names the silent node; what was recorded so far is
+kept. Internal: `ato-hil run` starts it.
 """
 
 from __future__ import annotations
@@ -79,7 +80,8 @@ def agree(
             if plant.confirmed(node, here.rx):
                 faults = int(get(int(here.rx["payload"][ATO_STATUS.index]), ATO_STATUS.Faults))
             here.rx["fresh"][:] = 0
-            # Every announcement is answered: none of the answers may fall into the run that follows.
+            # Every announcement is answered: none of the answers may fall into the run that
+            # follows.
             if faults is not None and answered >= sent:
                 return faults
     what = "armed" if run_state == plant.ARMED else "ended"
@@ -113,9 +115,7 @@ def drive(
                     f"controller is silent: no FORCE_CMD for tick {tick} of run {run}"
                     f" within {timeout_s:g} s"
                 )
-        here.actuate_and_advance(
-            here.params, here.track, here.state, chance, tick, here.rx, truth
-        )
+        here.actuate_and_advance(here.params, here.track, here.state, chance, tick, here.rx, truth)
         rx_fresh.fill(0)
         if stop.requested:
             raise Stopped
@@ -154,7 +154,8 @@ def one_run(
 
 
 def main() -> int:
-    """Exit status 0 after all runs or SIGTERM, 1 for bad input, 2 if the bus is gone, 3 for a silent node."""
+    """Exit status 0 after all runs or SIGTERM, 1 for bad input, 2 if the bus is gone, 3 for a
+    silent node."""
     parser = argparse.ArgumentParser(prog="python -m plant_sim.process", description=__doc__)
     parser.add_argument("--scenario", required=True)
     parser.add_argument("--bus", required=True)

@@ -1,7 +1,9 @@
-"""Scenarios: one TOML file holds every number of a run; validated on loading, with one clear line for what is wrong.
+"""Scenarios: one TOML file holds every number of a run; validated on loading, with one clear line
+for what is wrong.
 
-A scenario may stand on another: `base = "subway-paper"` takes that one's values and replaces what this file states. Found by
-name among the packaged scenarios, or as the path of a file (a base's is relative to the file that names it).
+A scenario may stand on another: `base = "subway-paper"` takes that one's values and replaces what
+this file states. Found by name among the packaged scenarios, or as the path of a file (a base's is
+relative to the file that names it).
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from plant_sim.track import Track
 from plant_sim.trains import couplers, lumped
 
 FOLDER = Path(__file__).with_name("scenarios")
-# The train models; key `train.model` chooses. Each file has a Train, PARAMS, STATE, calibrate, and the steps reset, command, advance.
+# The train models; key `train.model` chooses. Each file has a Train, PARAMS, STATE, calibrate, and
+# the steps reset, command, advance.
 MODELS: dict[type, ModuleType] = {lumped.Train: lumped, couplers.Train: couplers}
 AnyTrain = lumped.Train | couplers.Train
 
@@ -57,7 +60,13 @@ class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     hold_ticks: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 1  # a value stays for so many ticks
 
 
-class Metrics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"from_s": "from", "to_s": "to"}):
+class Metrics(
+    msgspec.Struct,
+    frozen=True,
+    forbid_unknown_fields=True,
+    kw_only=True,
+    rename={"from_s": "from", "to_s": "to"},
+):
     """Window of the errors in the summary, seconds; the whole run by default."""
 
     from_s: float = 0.0
@@ -65,7 +74,8 @@ class Metrics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The controller's settings that do not belong to one law; checked by the controller's calibration."""
+    """The controller's settings that do not belong to one law; checked by the controller's
+    calibration."""
 
     preview_ticks: Ticks = 0  # the reference acceleration is read this far ahead
     distribute: bool = False  # give each car a force of its own
@@ -124,7 +134,8 @@ def find(name: str) -> Path:
     path = FOLDER / f"{name}.toml"
     if not path.is_file():
         raise ScenarioError(
-            f"scenario {name!r} is unknown, expected one of {', '.join(scenario_names())}, or a .toml file"
+            f"scenario {name!r} is unknown, expected one of {', '.join(scenario_names())},"
+            " or a .toml file"
         )
     return path
 
@@ -191,7 +202,10 @@ def _where(message: str) -> str:
 def _check(path: Path, scenario: Scenario) -> None:
     """What types cannot say."""
     if scenario.law not in scenario.laws:
-        raise ScenarioError(f"{path}: key law: {scenario.law!r} has no gains, expected a table [laws.{scenario.law}]")
+        raise ScenarioError(
+            f"{path}: key law: {scenario.law!r} has no gains,"
+            f" expected a table [laws.{scenario.law}]"
+        )
     if scenario.runs < 1:
         raise ScenarioError(f"{path}: key runs: {scenario.runs}, expected 1 or more")
     if isinstance(scenario.train, couplers.Train):

@@ -1,6 +1,7 @@
 """A plant ready to run: the compiled steps with their buffers, and the chance of each run.
 
-The same object serves the plant process (HIL), the single-process loop (SIL) and the interpreted run (MIL).
+The same object serves the plant process (HIL), the single-process loop (SIL) and the interpreted
+run (MIL).
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ class World:
     loaded: Loaded
     seed: int
     steps: tuple[Any, Any, Any]  # of plant.build, for loops that are compiled around them
-    begin: Any  # the same for Python: params and state as arrays of one record, the tick as an index
+    begin: (
+        Any  # the same for Python: params and state as arrays of one record, the tick as an index
+    )
     sense: Any
     actuate_and_advance: Any
     params: Any  # (1,)
@@ -45,7 +48,8 @@ def rows(array: np.ndarray) -> Any:
 def callable_steps(
     begin_step: Any, sense_step: Any, actuate_and_advance_step: Any
 ) -> tuple[Any, Any, Any]:
-    """The plant's steps for Python. Arrays are ten times cheaper to pass than records: a record is described field by field."""
+    """The plant's steps for Python. Arrays are ten times cheaper to pass than records: a record is
+    described field by field."""
 
     @step
     def begin(params: Any, state: Any) -> None:

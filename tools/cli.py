@@ -70,7 +70,9 @@ class Screen:
         self.bar = Progress(
             TextColumn("run {task.fields[run]} of {task.fields[last_run]}"),
             BarColumn(),
-            TextColumn("{task.percentage:>3.0f} %  {task.fields[rate]} ticks/s  {task.fields[last]}"),
+            TextColumn(
+                "{task.percentage:>3.0f} %  {task.fields[rate]} ticks/s  {task.fields[last]}"
+            ),
             TimeElapsedColumn(),
             console=console,
             transient=True,
@@ -82,7 +84,8 @@ class Screen:
         self.runs, self.ticks = runs, loaded.ticks
         self.title = f"{loaded.name}, {law}, {self.mode.value}"
         console.print(
-            f"{loaded.scenario.title}: law {law}, {len(runs)} runs of {loaded.ticks} ticks, {self.mode.value}",
+            f"{loaded.scenario.title}: law {law}, {len(runs)} runs of {loaded.ticks} ticks,"
+            f" {self.mode.value}",
             soft_wrap=True,
         )
         self.task = self.bar.add_task(
@@ -105,15 +108,21 @@ class Screen:
         self.rows.append(row)
         self.faults += len(row["faults"])
         last = f"last: {row['max_position_error_m'] * 1e3:.2f} mm, {self.faults} faults"
-        self.bar.update(self.task, completed=(row["run"] - self.runs[0] + 1) * self.ticks, last=last)
+        self.bar.update(
+            self.task, completed=(row["run"] - self.runs[0] + 1) * self.ticks, last=last
+        )
         if not console.is_terminal:
-            cells = [f"{name.split(chr(10))[0]} {_cell(row, key, f, s)}" for name, key, f, s in COLUMNS]
-            console.print("  ".join(cells + [_faults(row)]).rstrip(), soft_wrap=True)
+            cells = [
+                f"{name.split(chr(10))[0]} {_cell(row, key, f, s)}" for name, key, f, s in COLUMNS
+            ]
+            console.print("  ".join([*cells, _faults(row)]).rstrip(), soft_wrap=True)
 
 
 def _cell(row: dict[str, Any], key: str, factor: float, text: str) -> str:
     value = row[key]
-    return "-" if value is None else text.format(value if isinstance(value, int) else value * factor)
+    return (
+        "-" if value is None else text.format(value if isinstance(value, int) else value * factor)
+    )
 
 
 def _faults(row: dict[str, Any]) -> str:
@@ -139,27 +148,58 @@ def _fail(message: str, code: int) -> typer.Exit:
 
 @app.command()
 def run(
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario (`ato-hil list`) or a .toml file.")],
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario (`ato-hil list`) or a .toml file.")
+    ],
     law: Annotated[str | None, typer.Option(help="Control law; the scenario's by default.")] = None,
-    runs: Annotated[int | None, typer.Option(min=1, help="Runs in a row; the scenario's by default.")] = None,
-    mode: Annotated[Mode, typer.Option(help="hil: processes on a bus; sil: one compiled loop; mil: interpreted, checked.")] = Mode.hil,
-    bus: Annotated[str, typer.Option(help="auto, hub, hub:NAME, vcan, socketcan:NAME or INTERFACE:CHANNEL of python-can.")] = "auto",
-    pace: Annotated[Pace, typer.Option(help="lockstep: as fast as the bus, deterministic.")] = Pace.lockstep,
+    runs: Annotated[
+        int | None, typer.Option(min=1, help="Runs in a row; the scenario's by default.")
+    ] = None,
+    mode: Annotated[
+        Mode,
+        typer.Option(
+            help="hil: processes on a bus; sil: one compiled loop; mil: interpreted, checked."
+        ),
+    ] = Mode.hil,
+    bus: Annotated[
+        str,
+        typer.Option(
+            help="auto, hub, hub:NAME, vcan, socketcan:NAME or INTERFACE:CHANNEL of python-can."
+        ),
+    ] = "auto",
+    pace: Annotated[
+        Pace, typer.Option(help="lockstep: as fast as the bus, deterministic.")
+    ] = Pace.lockstep,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise and disturbance.")] = 1,
-    out: Annotated[Path | None, typer.Option(help="Folder of trace.rrd and summary.json; runs/SCENARIO-LAW-MODE by default.")] = None,
-    memory: Annotated[Path | None, typer.Option(help="Learning memory: read if it exists, written after each run.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of trace.rrd and summary.json; runs/SCENARIO-LAW-MODE by default."
+        ),
+    ] = None,
+    memory: Annotated[
+        Path | None,
+        typer.Option(help="Learning memory: read if it exists, written after each run."),
+    ] = None,
     trace: Annotated[bool, typer.Option(help="Write trace.rrd.")] = True,
 ) -> None:
     """Run a scenario: the train follows its profile, run by run."""
     if mode is Mode.mil and os.environ.get("ATO_HIL_INTERPRETED") != "1":
-        # The choice is made when the steps are imported, so in a process that has not imported them.
+        # The choice is made when the steps are imported, so in a process that has not imported
+        # them.
         environment = {**os.environ, "ATO_HIL_INTERPRETED": "1"}
         os.execve(sys.executable, [sys.executable, "-m", "tools.cli", *sys.argv[1:]], environment)
     try:
         _run(scenario, law, runs, mode, bus, seed, out, memory, trace)
     except ValueError as error:
-        # Bad input of every kind (scenario, law, DBC, bus, memory file) is a ValueError of ours with one line.
-        if type(error).__module__.split(".")[0] not in ("can_dbc", "controller", "plant_sim", "tools"):
+        # Bad input of every kind (scenario, law, DBC, bus, memory file) is a ValueError of ours
+        # with one line.
+        if type(error).__module__.split(".")[0] not in (
+            "can_dbc",
+            "controller",
+            "plant_sim",
+            "tools",
+        ):
             raise
         raise _fail(str(error), EXIT_BAD_INPUT) from None
 
@@ -211,7 +251,8 @@ def list_scenarios() -> None:
             loaded = load(name)
             default = loaded.scenario.law
             others = sorted(set(loaded.scenario.laws) - {default})
-            length = f"{loaded.profile.position_m[-1]:.0f} m, {loaded.ticks * loaded.scenario.period_s:.0f} s"
+            duration_s = loaded.ticks * loaded.scenario.period_s
+            length = f"{loaded.profile.position_m[-1]:.0f} m, {duration_s:.0f} s"
             table.add_row(name, " ".join([default, *others]), length, loaded.scenario.title)
     except ScenarioError as error:
         raise _fail(str(error), EXIT_BAD_INPUT) from None
@@ -231,6 +272,25 @@ def doctor() -> None:
     console.print(table)
     if any(finding.state == "broken" for finding in findings):
         raise typer.Exit(EXIT_BAD_INPUT)
+
+
+@app.command()
+def bench(
+    bus: Annotated[str, typer.Option(help="Bus of the HIL figure.")] = "hub:bench",
+) -> None:
+    """Measure the rates of SIL and HIL as ratios to a peer in the same run."""
+    from tools import bench as rates
+
+    table = Table("what", "ticks/s", "peer", "peer's ticks/s", "ratio", header_style="bold")
+    for figure in rates.measure(bus):
+        table.add_row(
+            figure.what,
+            f"{figure.ticks_per_s:,.0f}",
+            figure.peer,
+            f"{figure.peer_ticks_per_s:,.0f}",
+            f"{figure.ratio:.2f}",
+        )
+    console.print(table)
 
 
 def main() -> None:

@@ -34,7 +34,9 @@ def examine() -> list[Finding]:
 
 
 def _python() -> Finding:
-    return Finding("Python", "works", f"{platform.python_version()} on {platform.machine()}, {sys.platform}")
+    return Finding(
+        "Python", "works", f"{platform.python_version()} on {platform.machine()}, {sys.platform}"
+    )
 
 
 def _compiler() -> Finding:
@@ -49,8 +51,12 @@ def _compiler() -> Finding:
 
         right = probe(41) == 42
     except Exception as error:  # whatever the compiler raises is the finding
-        return Finding("compiler", "broken", f"numba cannot compile here: {' '.join(str(error).split())[:200]}")
-    return Finding("compiler", "works" if right else "broken", f"numba {numba.__version__} compiled a step")
+        return Finding(
+            "compiler", "broken", f"numba cannot compile here: {' '.join(str(error).split())[:200]}"
+        )
+    return Finding(
+        "compiler", "works" if right else "broken", f"numba {numba.__version__} compiled a step"
+    )
 
 
 def _cache() -> Finding:
@@ -67,7 +73,11 @@ def _cache() -> Finding:
             "broken",
             f"{folder}: {error.strerror}; set NUMBA_CACHE_DIR to a folder that can be written",
         )
-    return Finding("compiler cache", "works", f"{folder} can be written; the first run compiles, later ones load")
+    return Finding(
+        "compiler cache",
+        "works",
+        f"{folder} can be written; the first run compiles, later ones load",
+    )
 
 
 def _dbc() -> Finding:
@@ -102,7 +112,8 @@ def _vcan0() -> Finding:
     return Finding(
         "bus socketcan:vcan0",
         "absent",
-        f"{reason}; on a kernel with CAN: sudo modprobe vcan; sudo ip link add dev vcan0 type vcan; sudo ip link set up vcan0",
+        f"{reason}; on a kernel with CAN: sudo modprobe vcan;"
+        " sudo ip link add dev vcan0 type vcan; sudo ip link set up vcan0",
     )
 
 
@@ -110,7 +121,9 @@ def _private_vcan() -> Finding:
     from can_dbc.bus import private_vcan_reason
 
     reason = private_vcan_reason()
-    return Finding("bus vcan", "absent" if reason else "works", reason or "a private vcan can be made")
+    return Finding(
+        "bus vcan", "absent" if reason else "works", reason or "a private vcan can be made"
+    )
 
 
 def _viewer() -> Finding:
@@ -118,4 +131,9 @@ def _viewer() -> Finding:
     found = shutil.which("rerun") or (str(beside) if beside.exists() else None)
     if found is None:
         return Finding("viewer", "absent", "no `rerun` command; pip install rerun-sdk brings it")
-    return Finding("viewer", "works", f"{Path(found).name} is installed; on a machine with no screen: rerun --serve-web --bind 127.0.0.1 TRACE")
+    return Finding(
+        "viewer",
+        "works",
+        f"{Path(found).name} is installed;"
+        " on a machine with no screen: rerun --serve-web --bind 127.0.0.1 TRACE",
+    )

@@ -1,7 +1,8 @@
-"""HIL: recorder, controller and plant as processes of their own on one bus; this process starts, watches and ends them.
+"""HIL: recorder, controller and plant as processes of their own on one bus; this process starts,
+watches and ends them.
 
-A process that dies, a node that falls silent or Ctrl-C ends the run within two seconds, names the cause, keeps the traces so far, and
-leaves no process and no socket behind.
+A process that dies, a node that falls silent or Ctrl-C ends the run within two seconds, names the
+cause, keeps the traces so far, and leaves no process and no socket behind.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Generator
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -89,7 +90,8 @@ class Bench:
         self.events.put((node, {"event": "closed"}))
 
     def next_event(self, timeout_s: float) -> tuple[Node, dict[str, Any]] | None:
-        """The next event of any node, None after `timeout_s`. Raises RunError for an error or a node that died."""
+        """The next event of any node, None after `timeout_s`. Raises RunError for an error or a
+        node that died."""
         try:
             node, event = self.events.get(timeout=timeout_s)
         except queue.Empty:
@@ -100,7 +102,9 @@ class Bench:
         if event["event"] == "closed":
             code = node.process.wait()
             if "done" not in node.said:
-                raise RunError(f"the {node.name} process ended ({_exit_text(code)}){_last_line(node)}")
+                raise RunError(
+                    f"the {node.name} process ended ({_exit_text(code)}){_last_line(node)}"
+                )
         return node, event
 
     def wait_ready(self) -> None:
@@ -113,7 +117,8 @@ class Bench:
                 raise RunError(f"{', '.join(late)} not ready within {READY_TIMEOUT_S:g} s")
 
     def end(self) -> None:
-        """Ends plant and controller, then the recorder, which writes what it has; kills what does not end."""
+        """Ends plant and controller, then the recorder, which writes what it has; kills what does
+        not end."""
         for name in ("plant", "controller"):
             self._end(name, STOP_TIMEOUT_S)
         recorder = self.nodes.get("recorder")
@@ -134,10 +139,8 @@ class Bench:
             node.process.wait()
         for stream in (node.process.stdin, node.process.stdout):
             if stream is not None:
-                try:
+                with suppress(BrokenPipeError):
                     stream.close()
-                except BrokenPipeError:
-                    pass
 
 
 def _exit_text(code: int) -> str:
@@ -166,8 +169,9 @@ def run(
     out: Path,
     memory_file: Path | None,
     recorder_arguments: list[str],
-) -> Iterator[tuple[Node, dict[str, Any], Bench]]:
-    """Events of the nodes until all runs are done and recorded; see the `tell` calls of the processes.
+) -> Generator[tuple[Node, dict[str, Any], Bench], None, None]:
+    """Events of the nodes until all runs are done and recorded; see the `tell` calls of the
+    processes.
 
     Raises RunError with one line if a node dies, falls silent or reports an error.
     """

@@ -1,6 +1,7 @@
 """One row of the summary: what a run was like, from the true state of the plant.
 
-Errors are of the true state against the reference, over the scenario's window; everything else is over the whole run.
+Errors are of the true state against the reference, over the scenario's window; everything else is
+over the whole run.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ def run_metrics(
 ) -> dict[str, Any]:
     """Metrics of one run, keys with units.
 
-    `truth` [ticks] of plant.TRUTH; `command_n` [ticks] total force commanded, N; `alpha` (1/s) weighs the position error in the
-    augmented error delta = alpha e + ed, None for laws without it (delta is then reported as null).
+    `truth` [ticks] of plant.TRUTH; `command_n` [ticks] total force commanded, N; `alpha` (1/s)
+    weighs the position error in the augmented error delta = alpha e + ed, None for laws without it
+    (delta is then reported as null).
     """
     scenario = loaded.scenario
     ticks = len(truth)
@@ -42,9 +44,7 @@ def run_metrics(
         "stop_error_m": float(position_error[-1]),
         "max_acceleration_m_s2": _peak(truth["acceleration_m_s2"]),
         "rms_command_jerk_m_s3": _rms(jerk),
-        "overspeed_margin_m_s": float(
-            np.min(truth["permitted_speed_m_s"] - truth["speed_m_s"])
-        ),
+        "overspeed_margin_m_s": float(np.min(truth["permitted_speed_m_s"] - truth["speed_m_s"])),
         "energy_kwh_per_t": float(truth["traction_j"][-1]) / 3.6e6 / (mass / 1000.0),
     }
 

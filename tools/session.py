@@ -1,7 +1,7 @@
 """One session: the runs of one scenario and law in one mode, with their trace and summary.
 
-Modes: `sil` (one compiled loop), `mil` (the same loop interpreted, in a process started with ATO_HIL_INTERPRETED=1), `hil` (three
-processes on a bus). All give the same digest.
+Modes: `sil` (one compiled loop), `mil` (the same loop interpreted, in a process started with
+ATO_HIL_INTERPRETED=1), `hil` (three processes on a bus). All give the same digest.
 """
 
 from __future__ import annotations
@@ -80,8 +80,9 @@ class Session:
 def run(options: Options, listener: Listener) -> dict[str, Any]:
     """Runs the session; returns and writes the summary.
 
-    Raises ScenarioError, LawError, CalibrationError, BusError, MemoryFileError, SessionError for bad input, RunError if a run ends early
-    (the summary then holds the runs that were completed and the reason), KeyboardInterrupt likewise.
+    Raises ScenarioError, LawError, CalibrationError, BusError, MemoryFileError, SessionError for
+    bad input, RunError if a run ends early (the summary then holds the runs that were completed
+    and the reason), KeyboardInterrupt likewise.
     """
     loaded = load(options.scenario)
     law = options.law or loaded.scenario.law
@@ -138,7 +139,12 @@ def _write_summary(path: Path, summary: dict[str, Any]) -> None:
 
 
 def _finish_run(
-    session: Session, run: int, frames: np.ndarray, truth: np.ndarray, seconds: float, faults: list[str]
+    session: Session,
+    run: int,
+    frames: np.ndarray,
+    truth: np.ndarray,
+    seconds: float,
+    faults: list[str],
 ) -> dict[str, Any]:
     """The row of a run, added to the summary and shown."""
     measured = metrics.run_metrics(
@@ -194,7 +200,9 @@ def _trace_settings(session: Session) -> dict[str, Any]:
         "last_run": session.runs[-1],
         "period_s": loaded.scenario.period_s,
         "estimates": [f"{name} [{unit}]" for name, unit, _q in module.ESTIMATES],
-        "cars": len(loaded.scenario.train.effectiveness) if loaded.scenario.control.distribute else 0,
+        "cars": len(loaded.scenario.train.effectiveness)
+        if loaded.scenario.control.distribute
+        else 0,
     }
 
 
@@ -221,7 +229,9 @@ def _run_hil(session: Session, calibration: Any) -> None:
     options, loaded = session.options, session.loaded
     choice = choose_bus(options.bus)
     if choice.interface == "virtual":
-        raise SessionError(f"bus {options.bus!r} lives inside one process; HIL needs one between processes")
+        raise SessionError(
+            f"bus {options.bus!r} lives inside one process; HIL needs one between processes"
+        )
     session.summary["bus"] = choice.name
     session.listener.note(f"bus {choice.name}: {choice.reason}")
     _refuse_busy_bus(choice.name)
@@ -246,7 +256,9 @@ def _refuse_busy_bus(name: str) -> None:
     """Two sessions on one bus would answer each other."""
     with open_bus(name) as bus:
         if recv_frames(bus, 0.3):
-            raise SessionError(f"bus {name!r} carries other traffic; choose another, e.g. --bus hub:second")
+            raise SessionError(
+                f"bus {name!r} carries other traffic; choose another, e.g. --bus hub:second"
+            )
 
 
 def _on_event(

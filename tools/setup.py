@@ -48,15 +48,17 @@ def _settings(key: str, values: dict[str, Any], kind: Any) -> Any:
 
 
 def run_numbers(law: str, runs: int, learned: int = -1) -> range:
-    """Numbers of the next `runs` runs: on from the run that a memory file learned last (`learned`), else from 1, after
-    an initial run 0 for laws that learn from one (INITIAL_RUN in their file)."""
+    """Numbers of the next `runs` runs: on from the run that a memory file learned last
+    (`learned`), else from 1, after an initial run 0 for laws that learn from one (INITIAL_RUN in
+    their file)."""
     if learned >= 0:
         return range(learned + 1, learned + 1 + runs)
     return range(0 if getattr(load_law(law), "INITIAL_RUN", False) else 1, runs + 1)
 
 
 def error_weight(loaded: Loaded, law: str) -> float | None:
-    """alpha of the augmented error: the law's own, else that of the scenario's default law, else None."""
+    """alpha of the augmented error: the law's own, else that of the scenario's default law, else
+    None."""
     for name in (law, loaded.scenario.law):
         alpha = loaded.scenario.laws[name].get("alpha")
         if alpha is not None:

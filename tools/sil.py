@@ -1,6 +1,8 @@
-"""SIL: the whole chain in one process, compiled as one loop; MIL: the same loop interpreted on checked integers.
+"""SIL: the whole chain in one process, compiled as one loop; MIL: the same loop interpreted on
+checked integers.
 
-Plant and controller exchange the same protected frames as over a bus, tick by tick, and every frame is logged.
+Plant and controller exchange the same protected frames as over a bus, tick by tick, and every
+frame is logged.
 """
 
 from __future__ import annotations
@@ -56,7 +58,8 @@ def clear(mailboxes: Any) -> None:
 
 
 def build_loop(controller_tick: Any, sense: Any, actuate_and_advance: Any) -> Any:
-    """Loop over `ticks` control periods of plant and controller; returns the number of frames logged."""
+    """Loop over `ticks` control periods of plant and controller; returns the number of frames
+    logged."""
 
     @step
     def loop(
@@ -145,10 +148,17 @@ def run(
         _announce(here, node, plant.ENDED, number)
         if progress:
             progress(number, loaded.ticks)
-        yield RunResult(number, np.asarray(frames[:count]).view(FRAME).copy(), truth, faults, seconds), node
+        yield (
+            RunResult(
+                number, np.asarray(frames[:count]).view(FRAME).copy(), truth, faults, seconds
+            ),
+            node,
+        )
 
 
-def _announce(here: world.World, node: controller_node.Controller, run_state: int, run: int) -> None:
+def _announce(
+    here: world.World, node: controller_node.Controller, run_state: int, run: int
+) -> None:
     """RUN_CTRL outside a run, and the controller's answer."""
     clear(node.rx)
     clear(node.tx)

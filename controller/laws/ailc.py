@@ -1,11 +1,13 @@
-"""AILC: adaptive iterative learning control without a barrier (paper 1, eqs. (12), (13)); the sibling of CAILC.
+"""AILC: adaptive iterative learning control without a barrier (paper 1, eqs. (12), (13)); the
+sibling of CAILC.
 
     delta = alpha e + ed
     Xi_i  = Xi_{i-1} + Gamma xi delta,  xi = [-1, -v, -v^2]                                     (13)
     u     = Xi_1 + Xi_2 v + Xi_3 v^2 + M a_r - M alpha ed - beta delta                          (12)
 
-The law has no parameter bounds; its stored words saturate at the int32 range (theta_1: +-0.125 m/s^2, 24.3 kN for the
-paper's train) and never wrap. Symbols, units and formats: `controller/laws/cailc.py`.
+The law has no parameter bounds; its stored words saturate at the int32 range (theta_1: +-0.125
+m/s^2, 24.3 kN for the paper's train) and never wrap. Symbols, units and formats:
+`controller/laws/cailc.py`.
 """
 
 from __future__ import annotations

@@ -1,16 +1,20 @@
-"""CAILC: constrained adaptive iterative learning control of a multi-car subway train (paper 1, eqs. (30)-(35)).
+"""CAILC: constrained adaptive iterative learning control of a multi-car subway train (paper 1,
+eqs. (30)-(35)).
 
     e      = x - x_r,   ed = v - v_r                                tracking errors
     delta  = alpha e + ed                                           augmented error
     chi    = delta / cos^2(pi/2 r),  r = min(delta^2 / nu_b^2, r_max)   barrier                 (30)
-    Xi_i   = clamp(Xi_{i-1} + Gamma xi chi, Xi_min, Xi_max)         along runs, xi = [-1, -v, -v^2]  (33)-(35)
-    u      = Xi_1 + Xi_2 v + Xi_3 v^2 + M a_r - M alpha ed - beta delta                         (31)
+    Xi_i   = clamp(Xi_{i-1} + Gamma xi chi, Xi_min, Xi_max)         along runs, xi = [-1, -v, -v^2]
+     (33)-(35) u      = Xi_1 + Xi_2 v + Xi_3 v^2 + M a_r - M alpha ed - beta delta
+            (31)
 
-Everything is divided by the mass M: f = u/M, theta = Xi/M, Gamma/M, beta/M. Order in a tick: measure, delta, chi, Xi_i
-(with the current chi), u. a_r is previewed by the actuator's lag (firmware), e and ed are of now.
+Everything is divided by the mass M: f = u/M, theta = Xi/M, Gamma/M, beta/M. Order in a tick:
+measure, delta, chi, Xi_i (with the current chi), u. a_r is previewed by the actuator's lag
+(firmware), e and ed are of now.
 
-r_max is not in the paper: unclamped, chi is arbitrary where |delta| >= nu_b (the cosine is periodic). With the paper's
-gains 0.98 reproduces the paper; with faster learning 0.75 keeps the sampled loop's slope below 1.
+r_max is not in the paper: unclamped, chi is arbitrary where |delta| >= nu_b (the cosine is
+periodic). With the paper's gains 0.98 reproduces the paper; with faster learning 0.75 keeps the
+sampled loop's slope below 1.
 
 | symbol   | unit    | format        | symbol    | unit  | format |
 | e, ed, delta, chi | m, m/s | Q24   | a_r, f    | m/s^2 | Q27    |
@@ -75,13 +79,16 @@ class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
-    """PARAMS, shape (1,), from SI gains. Raises CalibrationError where a gain does not fit its format."""
+    """PARAMS, shape (1,), from SI gains. Raises CalibrationError where a gain does not fit its
+    format."""
     mass = vehicle.mass_kg
     params = np.zeros(1, PARAMS)
     params["alpha"] = fixed("alpha", gains.alpha, 16)
     params["beta"] = fixed("beta / M", gains.beta / mass, 24)
     for q in range(3):
-        params["gamma"][0, q] = fixed(f"Gamma[{q}] / M", gains.Gamma[q] / mass, GAMMA_Q[q], 27 if q else 32)
+        params["gamma"][0, q] = fixed(
+            f"Gamma[{q}] / M", gains.Gamma[q] / mass, GAMMA_Q[q], 27 if q else 32
+        )
         params["theta_min"][0, q] = fixed(f"Xi_min[{q}] / M", gains.Xi_min[q] / mass, THETA_Q[q])
         params["theta_max"][0, q] = fixed(f"Xi_max[{q}] / M", gains.Xi_max[q] / mass, THETA_Q[q])
     params["nu_b"] = fixed("nu_b", gains.nu_b, 24)
@@ -105,7 +112,8 @@ def learned(gains: Gains, vehicle: Vehicle) -> tuple[list[int], list[int], list[
 
 @step
 def barrier(delta: Any, nu_b: Any, inverse_nu_b: Any, s_min: Any) -> Any:
-    """chi = delta / cos^2(pi/2 r), Q24 saturated to +-128; cos(pi/2 r) = sin(pi/2 (1 - r)); one division."""
+    """chi = delta / cos^2(pi/2 r), Q24 saturated to +-128; cos(pi/2 r) = sin(pi/2 (1 - r)); one
+    division."""
     ratio = (clamp(delta, -nu_b, nu_b) * inverse_nu_b) >> 10  # delta / nu_b in [-1, 1], Q30
     r = (ratio * ratio) >> 30
     s = max((int64(1) << 30) - r, s_min)
@@ -131,7 +139,8 @@ def errors(params: Any, state: Any, inputs: Any) -> Any:
 def increments(params: Any, chi: Any, speed: Any, cell: Any) -> None:
     """cell.learn = Gamma xi chi / M with xi = [-1, -v, -v^2]; chi Q24, v Q22."""
     chi_v = round_shift(chi * speed, 22)
-    # Beyond 2^37 (8192 m^3/s^3) every theta is at its bound anyway; the product with Gamma stays below 2^63.
+    # Beyond 2^37 (8192 m^3/s^3) every theta is at its bound anyway; the product with Gamma stays
+    # below 2^63.
     chi_v2 = clamp(round_shift(chi_v * speed, 22), -(int64(1) << 37), int64(1) << 37)
     cell.learn[0] = sat32(-round_shift(chi * int64(params.gamma[0]), 20))
     cell.learn[1] = sat32(-round_shift(chi_v * int64(params.gamma[1]), 28))
@@ -139,13 +148,25 @@ def increments(params: Any, chi: Any, speed: Any, cell: Any) -> None:
 
 
 @step
-def force(params: Any, theta_1: Any, theta_2: Any, theta_3: Any, speed: Any, inputs: Any, ed: Any, delta: Any) -> Any:
-    """(31) divided by M, Q27: learned resistance, acceleration, damping; limited to what the actuators give."""
+def force(
+    params: Any,
+    theta_1: Any,
+    theta_2: Any,
+    theta_3: Any,
+    speed: Any,
+    inputs: Any,
+    ed: Any,
+    delta: Any,
+) -> Any:
+    """(31) divided by M, Q27: learned resistance, acceleration, damping; limited to what the
+    actuators give."""
     v2 = (speed * speed) >> 28  # Q16
     resistance = (
         round_shift(theta_1, 7) + round_shift(theta_2 * speed, 34) + round_shift(theta_3 * v2, 32)
     )
-    damping = round_shift(int64(params.alpha) * ed, 13) + round_shift(int64(params.beta) * delta, 21)
+    damping = round_shift(int64(params.alpha) * ed, 13) + round_shift(
+        int64(params.beta) * delta, 21
+    )
     wanted = resistance + int64(inputs.ahead_acceleration) - damping
     return clamp(wanted, -int64(params.force_max), int64(params.force_max))
 

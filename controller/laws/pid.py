@@ -56,7 +56,8 @@ class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
-    """PARAMS, shape (1,), from SI gains. Raises CalibrationError where a gain does not fit its format."""
+    """PARAMS, shape (1,), from SI gains. Raises CalibrationError where a gain does not fit its
+    format."""
     mass, period = vehicle.mass_kg, vehicle.period_s
     params = np.zeros(1, PARAMS)
     params["gp"] = fixed("gp / M", gains.gp / mass, 24)

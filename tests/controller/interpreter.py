@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from can_dbc.step import INTERPRETED, int64
+from controller.firmware import build_tick
+from controller.registry import law_step, load_law
 
 
 def argument(value: Any) -> Any:
@@ -23,6 +25,11 @@ def argument(value: Any) -> Any:
         rows = value.view(np.recarray)
         return rows[0] if rows.shape == (1,) else rows
     return value
+
+
+def tick(law: str, *arguments: Any) -> None:
+    """The cyclic task around a law."""
+    build_tick(law_step(load_law(law)))(*arguments)
 
 
 def main() -> None:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from controller import calibration, distribution
-from controller.calibration import CalibrationError, GuardSettings, MemorySettings
+from controller.calibration import GuardSettings, MemorySettings
 from controller.memory import initial_memory
-from controller.quantise import Vehicle, fixed
+from controller.quantise import CalibrationError, Vehicle, fixed
 from controller.reference import SEGMENT
 from controller.registry import LawError, law_names, law_number, load_law
 

@@ -139,6 +139,8 @@ def test_stiff_couplers_make_the_lumped_train(force):
     )
     rig = Rig(track=hills, coupler_stiffness_n_m=5e7, coupler_damping_n_s_m=1e6)
     rig.speed[:] = 15.0
+    phases = [(0.6, 0.8), (-0.8, 0.6)]  # trailers, motor cars
+    rig.train["phase"] = phases
     rig.run(force * MASSES / MASS, 800)
 
     rigid = msgspec.convert(data, lumped.Train)
@@ -147,6 +149,7 @@ def test_stiff_couplers_make_the_lumped_train(force):
     state, channels = np.zeros(1, lumped.STATE), np.zeros(1, actuator.STATE)
     lumped.reset(params[0], state[0])
     state["speed_m_s"] = 15.0
+    state["phase"][0, :2] = phases
     channels["target"][0, 0] = force
     for _ in range(800):
         lumped.advance(params[0], sections(hills), state[0], actuators[0], channels[0], 0.0)
@@ -217,6 +220,14 @@ def test_brake_and_resistance_also_oppose_rolling_back():
     assert free.run(np.zeros(6), 10)[1][-1] == pytest.approx(-1.0)
 
 
+def test_resistance_is_the_same_both_ways():
+    forward, backward = Rig(), Rig()
+    forward.speed[:], backward.speed[:] = 20.0, -20.0
+    ahead, back = (rig.run(np.zeros(6), 10)[1][-1] for rig in (forward, backward))
+    assert ahead == pytest.approx(-back, rel=1e-12)
+    assert ahead.max() < 20.0
+
+
 # What acts from outside.
 
 
@@ -263,7 +274,10 @@ def test_work_of_traction_is_kinetic_energy_and_heat():
     rig.run(1.5e5 * MOTORS / 3, 1000)
     kinetic = 0.5 * MASSES @ rig.speed**2
     assert rig.train["traction_j"] == pytest.approx(kinetic, rel=2e-3)
-    assert rig.train["traction_j"] > kinetic
+    work = rig.train["traction_j"].copy()
+    assert work > kinetic
+    rig.run(np.full(6, -2e4), 100)
+    assert rig.train["traction_j"] == work
 
 
 @pytest.mark.parametrize("change", [{"coupler_stiffness_n_m": 0.0}, {"coupler_damping_n_s_m": 0.0}])

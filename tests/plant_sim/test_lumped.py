@@ -55,26 +55,26 @@ class Rig:
         self.train["speed_m_s"] = speed
 
 
-def resistance_of_cars(v, t):
+def resistance_of_cars(v, t, train=TRAIN):
     """Sum of R_k, N: (57), (58), each car at its own speed (59)."""
     total, car_speed = 0.0, v
     for k in range(6):
-        source = TRAIN.motor_resistance if k + 1 in TRAIN.motor_cars else TRAIN.trailer_resistance
+        source = train.motor_resistance if k + 1 in train.motor_cars else train.trailer_resistance
         swing = math.sin(source.rad_per_s * t)
         a, b, c = (value + change * swing for value, change in (source.a, source.b, source.c))
         km_h = 3.6 * car_speed
         total += MASSES[k] * 9.81e-3 * (a + b * km_h + c * km_h**2)
         if k < 5:
-            sine, cosine = TRAIN.coupler_sine_m[k], TRAIN.coupler_cosine_m[k]
+            sine, cosine = train.coupler_sine_m[k], train.coupler_cosine_m[k]
             car_speed += sine * math.cos(t) - cosine * math.sin(t)
     return total
 
 
-def force_of_couplers(t):
+def force_of_couplers(t, train=TRAIN):
     """What accelerates cars 2 to 6 relative to the first: sum of m_k times sum of s'' before it."""
     total, relative = 0.0, 0.0
     for k in range(5):
-        relative -= TRAIN.coupler_sine_m[k] * math.sin(t) + TRAIN.coupler_cosine_m[k] * math.cos(t)
+        relative -= train.coupler_sine_m[k] * math.sin(t) + train.coupler_cosine_m[k] * math.cos(t)
         total += MASSES[k + 1] * relative
     return total
 
@@ -105,6 +105,23 @@ def test_motion_is_that_of_the_cars(force, speed):
     x, v = reference(force, 15.0, speed)
     assert positions[-1] == pytest.approx(x, abs=1e-4)
     assert speeds[-1] == pytest.approx(v, abs=5e-6)
+
+
+@pytest.mark.parametrize("t", [0.0, 1.0, 2.5, 4.0, 100.0])
+def test_each_car_has_the_resistance_of_its_own_speed(t):
+    # The couplers breathe a hundred times deeper than the paper's, so that it can be seen.
+    breathing = {
+        name: [100 * amplitude for amplitude in getattr(TRAIN, name)]
+        for name in ("coupler_sine_m", "coupler_cosine_m")
+    }
+    train = msgspec.structs.replace(TRAIN, **breathing)
+    rig = Rig(train=train)
+    rig.start_at(20.0)
+    for phase, rate in zip(rig.train["phase"], (0.002, 0.0039, 1.0), strict=True):
+        phase["sine"], phase["cosine"] = math.sin(rate * t), math.cos(rate * t)
+    rig.run(1e4, 1)
+    expected = (1e4 - resistance_of_cars(20.0, t, train) - force_of_couplers(t, train)) / MASS
+    assert rig.train["acceleration_m_s2"] == pytest.approx(expected, abs=2e-6)
 
 
 def test_the_resistance_swings_over_minutes():

@@ -1,4 +1,5 @@
-"""The main job through the product: SIL and HIL agree, and whatever ends a run early ends it cleanly."""
+"""The main job through the product: SIL and HIL agree, and whatever ends a run early ends it
+cleanly."""
 
 from __future__ import annotations
 
@@ -186,8 +187,19 @@ def test_a_dbc_without_a_needed_signal_is_one_clear_line(tmp_path: Path) -> None
 def start_long_run(tmp_path: Path) -> subprocess.Popen[str]:
     """A HIL run that would last for minutes, once it is under way."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "tools.cli", "run", "subway", "--runs", "50", "--out", "out"]
-        + ["--bus", channel(tmp_path)],
+        [
+            sys.executable,
+            "-m",
+            "tools.cli",
+            "run",
+            "subway",
+            "--runs",
+            "50",
+            "--out",
+            "out",
+            "--bus",
+            channel(tmp_path),
+        ],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

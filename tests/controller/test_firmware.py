@@ -1,0 +1,571 @@
+"""The cyclic task from outside: frames in, frames out."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from can_dbc import e2e
+from can_dbc.codec import (
+    ATO_ESTIMATE,
+    ATO_STATUS,
+    ATO_TRACKING,
+    ATP_LIMIT,
+    CAR_FORCE_1,
+    CAR_FORCE_2,
+    FORCE_CMD,
+    MESSAGE_COUNT,
+    MESSAGES,
+    RUN_CTRL,
+    TRAIN_POSITION,
+    TRAIN_SPEED,
+    get,
+    mailboxes,
+    put,
+)
+from controller import calibration, node, store
+from controller.calibration import GuardSettings, MemorySettings
+from controller.interface import (
+    ARMED,
+    BRAKE,
+    COAST,
+    ENDED,
+    FAULT_ATP,
+    FAULT_CONTROL_LOST,
+    FAULT_LIMIT_LOST,
+    FAULT_OVERSPEED,
+    FAULT_POSITION_LOST,
+    FAULT_SENSOR,
+    FAULT_SPEED_LOST,
+    FAULT_TICK,
+    GUARD_COAST,
+    GUARD_NORMAL,
+    GUARD_SERVICE_BRAKE,
+    IDLE,
+    RUNNING,
+    TRACTION,
+)
+from controller.quantise import Vehicle
+from controller.reference import SEGMENT
+
+MASS_KG = 200_000.0
+AGE_MAX = 5
+PREVIEW = 3
+# One tick at rest, then a ramp to 2.7 m/s and back: no tick but the first and the last stands.
+PROFILE = np.array([(1, 0), (100, 1800), (100, -1800), (100, -1800), (100, 1800)], SEGMENT)
+GAINS = {"kp": 1e5, "kD": 0.0, "gp": 3e5, "gI": 0.0, "gD": 0.0}
+
+
+def calibrated():
+    """A law that learns, two cars, previewed reference."""
+    return calibration.calibrate(
+        law="pdilc",
+        gains=GAINS,
+        vehicle=Vehicle(MASS_KG, 0.01, 1.5),
+        profile=PROFILE,
+        preview_ticks=PREVIEW,
+        memory_settings=MemorySettings(decimation=4),
+        guard_settings=GuardSettings(age_max_ticks=AGE_MAX, service_brake_m_s2=0.5),
+        car_effectiveness=[1.0, 1.0, 1.0],
+        motor_cars=[1, 3],
+        scenario_digest="d" * 32,
+    )
+
+
+@pytest.fixture(scope="module")
+def built():
+    """Compiled once; every test starts it anew."""
+    return node.build(calibrated())
+
+
+class Bench:
+    """The plant's side of one controller."""
+
+    def __init__(self, controller):
+        self.controller = controller
+        controller.state.view(np.uint8)[:] = 0
+        controller.state["links"]["counter"] = -1
+        controller.cells[:] = 0
+        controller.memory_file = None
+        for boxes in (controller.rx, controller.tx):
+            boxes[:] = 0
+        self.counters = [0] * MESSAGE_COUNT
+        self.tick = 0
+
+    # Frames to the controller.
+
+    def put(self, message, counter=None, **signals):
+        """A protected frame into its mailbox, with the next counter or this one."""
+        word = sum(put(getattr(message, name), raw) for name, raw in signals.items())
+        index = message.index
+        counter = self.counters[index] if counter is None else counter
+        self.counters[index] = e2e.next_counter(counter)
+        self.put_word(message, e2e.protect(word, counter, message.data_id))
+
+    def put_word(self, message, word):
+        self.controller.rx[message.index]["payload"] = word
+        self.controller.rx[message.index]["fresh"] = 1
+
+    def cycle(self, period):
+        """One call; the words that the controller sends, by message name."""
+        node.cycle(self.controller, period)
+        self.controller.rx["fresh"] = 0
+        tx = self.controller.tx
+        sent = {m.name: int(tx[m.index]["payload"]) for m in MESSAGES if tx[m.index]["fresh"]}
+        tx["fresh"] = 0
+        return sent
+
+    # Whole steps.
+
+    def control(self, run_state, iteration=1):
+        """RUN_CTRL alone."""
+        self.put(RUN_CTRL, RunState=run_state, Iteration=iteration)
+        return self.cycle(0)
+
+    def start(self, iteration=1):
+        """Armed, and ready for the first tick of a run."""
+        self.control(ARMED, iteration)
+        self.counters = [0] * MESSAGE_COUNT
+        self.tick = 0
+
+    def run_tick(self, speed=0.0, position=0.0, permitted=20.0, without=(), **signals):
+        """A tick of a run with all its frames but those of `without`; speeds in m/s."""
+        if self.tick % 10 == 0 and RUN_CTRL not in without:
+            self.put(RUN_CTRL, RunState=RUNNING, Iteration=1)
+        if ATP_LIMIT not in without:
+            supervision = signals.get("supervision", 0)
+            self.put(ATP_LIMIT, PermittedSpeed=round(permitted * 100), Supervision=supervision)
+        if TRAIN_SPEED not in without:
+            raw = round(speed / TRAIN_SPEED.Speed.scale)
+            self.put(TRAIN_SPEED, Speed=raw, Quality=signals.get("quality", 0))
+        if TRAIN_POSITION not in without:
+            raw = round(position / TRAIN_POSITION.Position.scale)
+            tick = signals.get("tick", self.tick) & 0xFFFF
+            self.put(TRAIN_POSITION, Position=raw, Tick=tick)
+        self.tick += 1
+        return self.cycle(1)
+
+    @property
+    def core(self):
+        return self.controller.state[0]["core"]
+
+    @property
+    def inputs(self):
+        return self.controller.state[0]["inputs"]
+
+    def link(self, message):
+        return self.controller.state[0]["links"][message.index]
+
+
+@pytest.fixture
+def bench(built):
+    return Bench(built)
+
+
+@pytest.fixture
+def running(bench):
+    """A controller in the first tick of a run."""
+    bench.start()
+    bench.run_tick()
+    return bench
+
+
+def status(sent):
+    word = sent[ATO_STATUS.name]
+    names = ("RunState", "Iteration", "Guard", "Faults", "Law")
+    return {name: int(get(word, getattr(ATO_STATUS, name))) for name in names}
+
+
+# Run control.
+
+
+def test_arming_is_answered_with_state_and_iteration(bench):
+    for iteration in (1, 2, 4095):
+        answer = status(bench.control(ARMED, iteration))
+        assert (answer["RunState"], answer["Iteration"]) == (ARMED, iteration)
+        assert answer["Law"] == 3  # pdilc
+
+
+def test_nothing_but_the_status_is_sent_outside_a_run(bench):
+    assert list(bench.control(ARMED)) == [ATO_STATUS.name]
+    assert list(bench.control(ENDED)) == [ATO_STATUS.name]
+    assert bench.cycle(1) == {}
+
+
+def test_a_run_starts_from_armed_only(bench):
+    assert bench.run_tick() == {}
+    assert bench.core["run_state"] == IDLE
+    bench.control(ENDED)
+    bench.tick = 0
+    assert bench.run_tick() == {}
+    bench.start()
+    assert FORCE_CMD.name in bench.run_tick()
+    assert bench.core["run_state"] == RUNNING
+
+
+def test_the_end_is_answered(running):
+    assert status(running.control(ENDED))["RunState"] == ENDED
+    assert status(running.control(ENDED))["RunState"] == ENDED  # again if asked again
+
+
+def test_idle_stops_a_run(running):
+    running.control(IDLE)
+    assert running.run_tick() == {}
+
+
+@pytest.mark.parametrize("unknown", [4, 5, 6, 7])
+def test_a_run_state_that_the_dbc_has_not_is_idle(running, unknown):
+    assert status(running.control(unknown))["RunState"] == IDLE
+    assert running.run_tick() == {}
+
+
+def test_run_control_alone_takes_no_time(running):
+    running.put(RUN_CTRL, RunState=RUNNING, Iteration=1)
+    assert running.cycle(0) == {}
+    assert running.core["tick"] == 1
+
+
+def test_a_new_run_starts_anew(running):
+    for _ in range(AGE_MAX + 2):
+        running.run_tick(speed=5.0, without=[TRAIN_SPEED])
+    assert running.core["faults"]
+    running.start(iteration=2)
+    assert (running.core["faults"], running.core["guard"]) == (0, GUARD_NORMAL)
+    assert running.link(TRAIN_SPEED).tolist() == (-1, 0, 0, 0)
+    assert running.core["iteration"] == 2
+    running.run_tick()
+    assert running.inputs["reference_position"] == 0
+    assert running.core["tick"] == 1
+
+
+# Frames of a run.
+
+
+def test_what_is_sent_in_which_tick(bench):
+    bench.start()
+    for tick in range(25):
+        expected = {CAR_FORCE_1.name, CAR_FORCE_2.name, FORCE_CMD.name}
+        if tick % 10 == 0:
+            expected |= {ATO_STATUS.name, ATO_TRACKING.name}
+        if tick % 10 < 2:  # the law has two estimates
+            expected.add(ATO_ESTIMATE.name)
+        sent = bench.run_tick()
+        assert set(sent) == expected
+        if ATO_ESTIMATE.name in sent:
+            assert get(sent[ATO_ESTIMATE.name], ATO_ESTIMATE.Index) == tick % 10
+            exponent = get(sent[ATO_ESTIMATE.name], ATO_ESTIMATE.Exponent)
+            assert exponent == (27, 24)[tick % 10]
+
+
+def test_every_command_echoes_its_tick(bench):
+    bench.start()
+    for tick in range(40):
+        assert get(bench.run_tick()[FORCE_CMD.name], FORCE_CMD.Tick) == tick
+    bench.core["tick"] = bench.tick = 0xFFFF
+    assert get(bench.run_tick()[FORCE_CMD.name], FORCE_CMD.Tick) == 0xFFFF
+    assert get(bench.run_tick()[FORCE_CMD.name], FORCE_CMD.Tick) == 0
+    assert bench.core["faults"] == 0
+
+
+def test_every_frame_is_protected_and_counted(bench):
+    bench.start()
+    last = {message.name: -1 for message in MESSAGES}
+    seen = dict.fromkeys(last, 0)
+    for _ in range(200):
+        for name, word in bench.run_tick().items():
+            message = next(m for m in MESSAGES if m.name == name)
+            assert e2e.check(word, last[name], message.data_id) == e2e.OK
+            last[name] = (word >> 8) & 15
+            seen[name] += 1
+    assert seen[FORCE_CMD.name] == 200
+    assert seen[ATO_STATUS.name] == seen[ATO_TRACKING.name] == 20
+
+
+def test_the_force_is_that_of_the_law(running):
+    """eps = v_r - v = 0.1 m/s: kp eps = 10 kN, shared by two motor cars of three."""
+    sent = running.run_tick(speed=-0.1)
+    word = sent[FORCE_CMD.name]
+    force = get(word, FORCE_CMD.Force) * FORCE_CMD.Force.scale
+    assert force == pytest.approx(10_000, abs=2)
+    assert get(word, FORCE_CMD.Mode) == TRACTION
+    cars = sent[CAR_FORCE_1.name], sent[CAR_FORCE_2.name]
+    assert get(cars[0], CAR_FORCE_1.Car1) / 16 == pytest.approx(force / 2, abs=0.1)
+    assert get(cars[0], CAR_FORCE_1.Car2) == 0
+    assert get(cars[1], CAR_FORCE_2.Car3) / 16 == pytest.approx(force / 2, abs=0.1)
+
+
+@pytest.mark.parametrize(("speed", "mode"), [(-0.1, TRACTION), (0.1, BRAKE), (0.0, COAST)])
+def test_the_mode_is_the_sign_of_the_force(bench, speed, mode):
+    bench.start()
+    sent = bench.run_tick(speed=speed)
+    assert get(sent[FORCE_CMD.name], FORCE_CMD.Mode) == mode
+
+
+def test_tracking_errors_are_what_was_measured_less_the_reference(bench):
+    bench.start()
+    word = bench.run_tick(speed=0.25, position=-1.5)[ATO_TRACKING.name]
+    assert get(word, ATO_TRACKING.PositionError) * ATO_TRACKING.PositionError.scale == -1.5
+    assert get(word, ATO_TRACKING.SpeedError) * ATO_TRACKING.SpeedError.scale == 0.25
+
+
+def test_tracking_errors_saturate(bench):
+    bench.start()
+    word = bench.run_tick(speed=-127.0, position=30_000.0)[ATO_TRACKING.name]
+    assert get(word, ATO_TRACKING.PositionError) == 2**23 - 1
+    assert get(word, ATO_TRACKING.SpeedError) == -(2**23)
+
+
+def test_the_reference_is_previewed(bench):
+    bench.start()
+    now, ahead = [], []
+    for _ in range(60):
+        bench.run_tick()
+        inputs = bench.inputs
+        now.append([int(inputs[f"reference_{q}"]) for q in ("position", "speed", "acceleration")])
+        ahead.append([int(inputs[f"ahead_{q}"]) for q in ("position", "speed", "acceleration")])
+    assert now[PREVIEW:] == ahead[:-PREVIEW]
+    assert now[0] == now[1] == [0, 0, 0]
+    assert now[-1] > [0, 0, 0]
+
+
+# What does not arrive, or arrives wrong.
+
+LINKS = [
+    (TRAIN_SPEED, FAULT_SPEED_LOST),
+    (TRAIN_POSITION, FAULT_POSITION_LOST),
+    (ATP_LIMIT, FAULT_LIMIT_LOST),
+]
+
+
+@pytest.mark.parametrize(("message", "fault"), LINKS, ids=lambda v: getattr(v, "name", ""))
+def test_a_message_is_missed_for_so_long_and_then_the_train_brakes(running, message, fault):
+    for age in range(1, AGE_MAX + 1):
+        running.run_tick(without=[message])
+        assert running.link(message)["age"] == age
+        assert running.core["faults"] == 0
+    word = running.run_tick(without=[message])[FORCE_CMD.name]
+    assert running.core["faults"] == fault
+    assert running.core["guard"] == GUARD_SERVICE_BRAKE
+    assert get(word, FORCE_CMD.Force) * FORCE_CMD.Force.scale == -0.5 * MASS_KG
+    assert get(word, FORCE_CMD.Mode) == BRAKE
+    running.run_tick()
+    assert running.link(message)["age"] == 0
+    assert running.core["faults"] == fault  # until the next run
+
+
+def test_run_control_may_be_older(running):
+    for _ in range(AGE_MAX + 20):
+        running.run_tick(without=[RUN_CTRL])
+        assert running.core["faults"] == 0
+    running.run_tick(without=[RUN_CTRL])
+    assert running.core["faults"] == FAULT_CONTROL_LOST
+
+
+def test_a_missed_measurement_keeps_the_last_value(running):
+    running.run_tick(speed=0.5, position=2.0)
+    running.run_tick(speed=0.7, position=3.0, without=[TRAIN_SPEED, TRAIN_POSITION])
+    assert running.inputs["speed"] == 1 << 23
+    assert running.inputs["position"] == 2 << 15
+
+
+@pytest.mark.parametrize("bit", [0, 9, 13, 20, 63])
+def test_a_damaged_frame_is_as_good_as_none(running, bit):
+    running.run_tick(speed=0.5)
+    for age in range(1, AGE_MAX + 2):
+        running.put(TRAIN_SPEED, Speed=round(0.9 / TRAIN_SPEED.Speed.scale), Quality=0)
+        word = int(running.controller.rx[TRAIN_SPEED.index]["payload"])
+        running.put_word(TRAIN_SPEED, word ^ (1 << bit if bit < 63 else -(1 << 63)))
+        running.run_tick(without=[TRAIN_SPEED])
+        assert running.link(TRAIN_SPEED)["age"] == age
+        assert running.link(TRAIN_SPEED)["lost"] == age
+        assert running.inputs["speed"] == 1 << 23
+    assert running.core["faults"] == FAULT_SPEED_LOST
+
+
+def test_a_repeated_frame_is_refused(running):
+    counter = (running.counters[TRAIN_SPEED.index] - 1) % 15
+    running.put(TRAIN_SPEED, counter=counter, Speed=1000)
+    running.run_tick(without=[TRAIN_SPEED])
+    assert running.inputs["speed"] == 0
+    assert running.link(TRAIN_SPEED)["lost"] == 1
+
+
+def test_after_a_gap_the_new_frame_counts_and_the_gap_too(running):
+    counter = (running.counters[TRAIN_SPEED.index] + 3) % 15
+    running.put(TRAIN_SPEED, counter=counter, Speed=1000)
+    running.run_tick(without=[TRAIN_SPEED])
+    assert running.inputs["speed"] == 1000 << 6
+    assert running.link(TRAIN_SPEED)["age"] == 0
+    assert running.link(TRAIN_SPEED)["lost"] == 1
+
+
+def test_a_frame_of_another_message_is_refused(running):
+    word = put(TRAIN_SPEED.Speed, 1000)
+    counter = running.counters[TRAIN_SPEED.index]
+    running.put_word(TRAIN_SPEED, e2e.protect(word, counter, TRAIN_POSITION.data_id))
+    running.run_tick(without=[TRAIN_SPEED])
+    assert running.inputs["speed"] == 0
+
+
+@pytest.mark.parametrize("jump", [-1, 1, 1000])
+def test_a_jump_of_the_tick_is_reported(running, jump):
+    running.run_tick(tick=running.tick + jump)
+    assert running.core["faults"] == FAULT_TICK
+    assert running.core["guard"] == GUARD_NORMAL
+
+
+def test_overspeed_coasts(running):
+    running.run_tick(speed=1.0, permitted=1.0)
+    assert running.core["faults"] == 0
+    for _ in range(100):
+        running.run_tick()
+    word = running.run_tick(speed=1.01, permitted=1.0)[FORCE_CMD.name]
+    assert running.core["faults"] == FAULT_OVERSPEED
+    assert running.core["guard"] == GUARD_COAST
+    assert running.inputs["limited"] == int(running.inputs["reference_speed"] > 1.01 * 2**24)
+    assert get(word, FORCE_CMD.Force) <= 0
+
+
+def test_a_limited_command_is_told_to_the_law(running):
+    running.run_tick(speed=-0.1)
+    assert running.inputs["limited"] == 0
+    running.run_tick(speed=-0.1, quality=2)
+    assert running.inputs["limited"] == 1
+
+
+def test_atp_brakes_the_train(running):
+    running.run_tick(supervision=1)
+    assert running.core["guard"] == GUARD_NORMAL
+    running.run_tick(supervision=2)
+    assert running.core["faults"] == FAULT_ATP
+    assert running.core["guard"] == GUARD_SERVICE_BRAKE
+
+
+def test_an_invalid_sensor_brakes_the_train(running):
+    running.run_tick(quality=1)
+    assert running.core["guard"] == GUARD_NORMAL
+    running.run_tick(quality=2)
+    assert running.core["faults"] == FAULT_SENSOR
+
+
+def test_faults_and_guard_are_reported(running):
+    running.run_tick(quality=2)
+    while ATO_STATUS.name not in (sent := running.run_tick()):
+        pass
+    answer = status(sent)
+    assert (answer["Faults"], answer["Guard"]) == (FAULT_SENSOR, GUARD_SERVICE_BRAKE)
+    assert answer["RunState"] == RUNNING
+
+
+# Learning between runs.
+
+
+def learned(bench):
+    generation = int(bench.controller.state[0]["memory"]["generation"])
+    return bench.controller.cells[generation].ravel().tolist()
+
+
+def short_run(bench, iteration, speed, **signals):
+    """Eight ticks, two cells, with a speed error."""
+    bench.start(iteration)
+    for _ in range(8):
+        bench.run_tick(speed=speed, **signals)
+
+
+def test_a_run_leaves_its_increments_for_the_next(bench):
+    short_run(bench, 1, -0.1)
+    assert set(learned(bench)) == {0}
+    bench.control(ENDED, 1)
+    first = learned(bench)[0]
+    assert first / 2**27 == pytest.approx(0.1 * GAINS["kp"] / MASS_KG, abs=1e-4)
+    bench.start(2)
+    word = bench.run_tick()[FORCE_CMD.name]
+    assert get(word, FORCE_CMD.Force) / 16 == pytest.approx(first / 2**27 * MASS_KG, abs=0.1)
+
+
+def test_a_run_with_a_fault_leaves_none(bench):
+    short_run(bench, 1, -0.1, quality=2)
+    bench.control(ENDED, 1)
+    assert set(learned(bench)) == {0}
+
+
+def test_a_run_that_is_armed_anew_leaves_none(bench):
+    short_run(bench, 1, -0.1)
+    short_run(bench, 1, 0.0)
+    bench.control(ENDED, 1)
+    assert max(learned(bench), key=abs) < 2**27 / 1000
+
+
+def test_only_the_end_of_a_run_ends_its_learning(bench):
+    short_run(bench, 1, -0.1)
+    bench.control(ENDED, 1)
+    kept = learned(bench)
+    for run_state in (ENDED, IDLE, ENDED, ARMED, IDLE, ENDED):
+        bench.control(run_state, 1)
+        assert learned(bench) == kept
+
+
+def test_an_end_without_a_run_does_not_touch_the_file(bench, tmp_path):
+    path = tmp_path / "learned.bin"
+    shape = bench.controller.cells.shape[1:]
+    store.save(path, bench.controller.calibration, np.full(shape, 7, np.int32), 5)
+    bench.controller.cells[0] = 7
+    bench.controller.memory_file = path
+    bench.control(ENDED, 5)
+    stored = store.load(path, bench.controller.calibration)
+    assert (stored.cells == 7).all()
+    assert stored.iteration == 5
+
+
+def test_the_file_is_there_before_the_end_is_answered(bench, tmp_path):
+    bench.controller.memory_file = tmp_path / "learned.bin"
+    short_run(bench, 3, -0.1)
+    bench.control(ENDED, 3)
+    stored = store.load(bench.controller.memory_file, bench.controller.calibration)
+    assert stored.iteration == 3
+    assert stored.cells.ravel().tolist() == learned(bench)
+
+
+# Garbage.
+
+
+@st.composite
+def garbage(draw):
+    """A mailbox word for some messages: any bits, half of them with a header that fits."""
+    boxes = []
+    for index in draw(st.lists(st.integers(0, MESSAGE_COUNT - 1), unique=True)):
+        word = draw(st.integers(-(2**63), 2**63 - 1))
+        if draw(st.booleans()):
+            counter = draw(st.integers(0, 14))
+            word = e2e.protect(word & ~0xFFFF, counter, MESSAGES[index].data_id)
+        boxes.append((index, word))
+    return boxes
+
+
+@settings(max_examples=60)
+@given(boxes=st.lists(garbage(), min_size=1, max_size=5), period=st.integers(0, 1))
+def test_whatever_is_in_the_mailboxes_nothing_overflows(built, interpreted, boxes, period):
+    bench = Bench(built)
+    bench.start()
+    bench.run_tick(speed=1.0, position=3.0)
+    controller = bench.controller
+    state, cells = controller.state.copy(), controller.cells.copy()
+    for content in boxes:
+        rx, tx = mailboxes(), mailboxes()
+        for index, word in content:
+            rx[index]["payload"], rx[index]["fresh"] = word, 1
+        controller.rx[:], controller.tx[:] = rx, tx
+        controller.call(
+            controller.params,
+            controller.profile,
+            controller.state,
+            controller.cells,
+            controller.rx,
+            controller.tx,
+            period,
+        )
+        checked = (controller.params, controller.profile, state, cells, rx, tx, period)
+        interpreted("__main__:tick", controller.calibration.law, *checked)
+        assert controller.tx.tobytes() == tx.tobytes()
+        assert controller.state.tobytes() == state.tobytes()
+        assert (controller.cells == cells).all()
