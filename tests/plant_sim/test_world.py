@@ -49,7 +49,10 @@ def test_noise_and_load_are_independent_of_each_other(variant):
     assert (both["disturbance_m_s2"] == disturbance["disturbance_m_s2"]).all()
     assert not noise["disturbance_m_s2"].any()
     assert not disturbance["speed_noise"].any()
-    assert abs(np.corrcoef(both["speed_noise"], both["disturbance_m_s2"])[0, 1]) < 0.05
+    # A noise is the sum of twelve random words, a load is one: they must not be the same words.
+    load_of_words = both["disturbance_m_s2"][: len(both) // 12 * 12].reshape(-1, 12).sum(axis=1)
+    noise_of_words = both["speed_noise"][: len(load_of_words)]
+    assert abs(np.corrcoef(noise_of_words, load_of_words)[0, 1]) < 0.1
 
 
 def test_noise_is_white_with_unit_variance(variant):
