@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from controller import distribution, firmware, memory, reference
-from controller.q import Q_FORCE
+from controller.q import Q_FORCE, Q_SPEED
 from controller.quantise import CalibrationError, Vehicle, fixed
 from controller.registry import law_number, load_law
 
@@ -38,6 +38,7 @@ class GuardSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     age_max_ticks: int = 10
     service_brake_m_s2: float = 0.8
+    overspeed_margin_m_s: float = 2 / 3.6  # above the permitted speed, before traction is cut
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,9 @@ def calibrate(
         params["guard"]["control_age_max"] = guard_settings.age_max_ticks + 20
         params["guard"]["service_brake"] = fixed(
             "guard.service_brake_m_s2", -abs(guard_settings.service_brake_m_s2), 27
+        )
+        params["guard"]["overspeed_margin"] = fixed(
+            "guard.overspeed_margin_m_s", guard_settings.overspeed_margin_m_s, Q_SPEED
         )
         params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
         ticks = int(profile["ticks"].sum()) + 1

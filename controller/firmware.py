@@ -337,7 +337,9 @@ def build_tick(law_step: Any) -> Any:
             )
         )
         core.faults = faults
-        core.guard = guard.state_of(faults)
+        core.guard = guard.state_of(
+            params.guard, faults, int64(inputs.speed), int64(core.permitted_speed)
+        )
         wanted = int64(state.outputs.force)
         specific = guard.limited(params.guard, int64(core.guard), wanted)
         force = round_shift(specific * int64(params.core.mass), Q_ACCELERATION)

@@ -29,7 +29,7 @@ PARAMS = np.dtype(
         ("age_max", np.int32),  # ticks without a valid frame after which a 10 ms message is lost
         ("control_age_max", np.int32),  # the same for RUN_CTRL, which comes every 100 ms
         ("service_brake", np.int32),  # specific force of the service brake, m/s^2, Q27, negative
-        ("padding", np.int32),
+        ("overspeed_margin", np.int32),  # above the permitted speed, m/s, Q24: traction is cut
     ],
     align=True,
 )
@@ -76,11 +76,13 @@ def faults_of_motion(speed: Any, permitted_speed: Any, supervision: Any) -> Any:
 
 
 @step
-def state_of(faults: Any) -> Any:
-    """What the guard does about the latched faults."""
+def state_of(params: Any, faults: Any, speed: Any, permitted_speed: Any) -> Any:
+    """What the guard does about the latched faults, and about the speed of now; speeds Q24.
+
+    Overspeed is reported from the first LSB; traction is cut while it is above the margin."""
     if faults & FAULTS_THAT_BRAKE:
         return int64(GUARD_SERVICE_BRAKE)
-    if faults & FAULT_OVERSPEED:
+    if speed > permitted_speed + int64(params.overspeed_margin):
         return int64(GUARD_COAST)
     return int64(GUARD_NORMAL)
 

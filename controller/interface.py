@@ -72,9 +72,9 @@ FAULTS: dict[int, str] = {
     FAULT_BARRIER: "barrier reached",
 }
 
-# A run with one of these leaves no trace in the learning memory; a law that reaches its barrier
-# still learns from it.
-FAULTS_THAT_BLOCK_LEARNING = sum(FAULTS) - FAULT_BARRIER
+# A run with one of these leaves no trace in the learning memory. A law that reaches its barrier or
+# the permitted speed still learns: that is how it comes to keep them.
+FAULTS_THAT_BLOCK_LEARNING = sum(FAULTS) - FAULT_BARRIER - FAULT_OVERSPEED
 
 
 def fault_names(bits: int) -> list[str]:

@@ -35,8 +35,8 @@ BRAKING = {
     FAULT_SENSOR,
     FAULT_ATP,
 }
-COASTING = {FAULT_OVERSPEED}
-REPORTING = {FAULT_TICK, FAULT_BARRIER}
+REPORTING = {FAULT_OVERSPEED, FAULT_TICK, FAULT_BARRIER}
+MARGIN = 1 << 23
 
 
 @pytest.fixture(scope="module")
@@ -45,23 +45,31 @@ def params():
     record["age_max"] = AGE_MAX
     record["control_age_max"] = CONTROL_AGE_MAX
     record["service_brake"] = BRAKE
+    record["overspeed_margin"] = MARGIN
     return record[0]
 
 
 def test_every_fault_has_its_consequence():
-    assert set(FAULTS) == BRAKING | COASTING | REPORTING
+    assert set(FAULTS) == BRAKING | REPORTING
 
 
-def test_what_the_guard_does_about_every_set_of_faults():
+def test_what_the_guard_does_about_every_set_of_faults(params):
     for choice in itertools.product([False, True], repeat=len(FAULTS)):
         present = {fault for fault, here in zip(FAULTS, choice, strict=True) if here}
         if present & BRAKING:
             expected = GUARD_SERVICE_BRAKE
-        elif present & COASTING:
-            expected = GUARD_COAST
         else:
             expected = GUARD_NORMAL
-        assert guard.state_of(sum(present)) == expected, fault_names(sum(present))
+        assert guard.state_of(params, sum(present), 0, 0) == expected, fault_names(sum(present))
+
+
+def test_traction_is_cut_above_the_margin_and_not_at_it(params):
+    permitted = 20 << 24
+    for above, expected in ((0, GUARD_NORMAL), (MARGIN, GUARD_NORMAL), (MARGIN + 1, GUARD_COAST)):
+        assert guard.state_of(params, 0, permitted + above, permitted) == expected
+    assert guard.state_of(params, FAULT_ATP, permitted + MARGIN + 1, permitted) == (
+        GUARD_SERVICE_BRAKE
+    )
 
 
 @pytest.mark.parametrize(

@@ -130,9 +130,11 @@ def cases(draw):
         "linear": draw(st.booleans()),
         "scale": scale,
     }
-    value = INT32 | st.integers(-1000, 1000)
-    row = st.lists(value, min_size=words, max_size=words)
-    runs = [draw(st.lists(row, min_size=ticks, max_size=ticks)) for _ in range(3)]
+    runs = []
+    for _ in range(3):
+        content = draw(st.binary(min_size=4 * ticks * words, max_size=4 * ticks * words))
+        rows = np.frombuffer(content, np.int32) >> draw(st.integers(0, 24))
+        runs.append(rows.reshape(ticks, words).tolist())
     kept = draw(st.lists(st.booleans(), min_size=3, max_size=3))
     return case, list(low), list(high), runs, kept
 
