@@ -63,6 +63,8 @@ def calibrate(
     guard_settings: GuardSettings,
     car_effectiveness: list[float],
     motor_cars: list[int],
+    car_traction_max_n: list[float],
+    car_brake_max_n: list[float],
     scenario_digest: str,
 ) -> Calibration:
     """PARAMS of the firmware for one law on one scenario. Raises CalibrationError or LawError with
@@ -90,7 +92,9 @@ def calibrate(
     except CalibrationError as error:
         raise CalibrationError(f"laws.{law}: {error}") from None
     if car_effectiveness:
-        params["distribution"] = distribution.calibrate(car_effectiveness, motor_cars)
+        params["distribution"] = distribution.calibrate(
+            car_effectiveness, motor_cars, car_traction_max_n or None, car_brake_max_n or None
+        )
     return Calibration(law, scenario_digest, params, profile, memory_settings.storage)
 
 
@@ -124,8 +128,8 @@ def _memory(
     module: Any, gains: Any, vehicle: Vehicle, settings: MemorySettings, ticks: int
 ) -> np.ndarray:
     params = np.zeros(1, memory.MEMORY_PARAMS)
-    words = len(module.WORDS)
-    if words == 0:
+    params["scale"] = 1
+    if not module.WORDS:
         return params
     if settings.decimation < 1:
         raise CalibrationError(f"memory.decimation is {settings.decimation}, expected 1 or more")
@@ -136,7 +140,10 @@ def _memory(
     if settings.storage not in ("int32", "int16"):
         raise CalibrationError(f"memory.storage is {settings.storage!r}, expected int32 or int16")
     initial, low, high = module.learned(gains, vehicle)
-    params["words"] = words
+    words = len(initial)
+    # A law whose gains learn only its first words stores only these; the others keep their value.
+    stored = getattr(module, "words_stored", lambda _: words)(gains)
+    params["words"] = stored
     params["cells"] = -(-ticks // settings.decimation)
     params["decimation"] = settings.decimation
     params["lead"] = settings.lead_ticks

@@ -191,7 +191,7 @@ def begin(params: Any, profile: Any, state: Any) -> None:
     for i in range(reference.PREVIEW_MAX):
         if i < int64(params.reference.preview):
             reference.advance(params.reference, state.ahead, profile)
-    memory.rewind(params.memory, state.memory)
+    memory.rewind(params.memory, state.memory, state.cell)
     state.inputs.limited = 0
 
 

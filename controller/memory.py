@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from can_dbc.step import int64, step
-from controller.q import clamp, divide_round, round_shift, sat32
+from controller.q import INT32_MAX, clamp, divide_round, round_shift, sat32
 
 WORDS_MAX = 8
 
@@ -63,10 +63,12 @@ MEMORY_STATE = np.dtype(
 
 
 @step
-def rewind(params: Any, state: Any) -> None:
-    """The state at the start of a run; the generation stays."""
+def rewind(params: Any, state: Any, cell: Any) -> None:
+    """The state at the start of a run; the generation stays. Words that are not stored are at their
+    initial value throughout."""
     for w in range(WORDS_MAX):
         state.total[w] = 0
+        cell.before[w] = params.initial[w]
     state.read_cell = 0
     state.read_phase = 0
     state.write_cell = 0
@@ -139,7 +141,9 @@ def close_cell(params: Any, state: Any, memory: Any) -> None:
                 mean = total if ticks == 1 else divide_round(total, ticks)
                 before = int64(memory[read, here, w]) * scale
                 value = clamp(before + mean, int64(params.low[w]), int64(params.high[w]))
-                memory[1 - read, here, w] = value if scale == 1 else divide_round(value, scale)
+                if scale != 1:
+                    value = min(divide_round(value, scale), INT32_MAX // scale)  # rounds up to 2^15
+                memory[1 - read, here, w] = value
                 state.total[w] = 0
         state.write_phase = 0
         state.write_cell = here + 1
@@ -149,7 +153,9 @@ def initial_memory(params: np.void, dtype: type = np.int32) -> np.ndarray:
     """Memory [2, cells, words] before the first run, all cells at `initial`."""
     cells, words = int(params["cells"]), int(params["words"])
     memory: np.ndarray = np.zeros((2, cells, words), dtype)
-    memory[:] = params["initial"][:words] // int(params["scale"])
+    scale = int(params["scale"])
+    nearest = (params["initial"][:words].astype(np.int64) + scale // 2) // scale
+    memory[:] = np.minimum(nearest, INT32_MAX // scale)
     return memory
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,9 +24,11 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-console = Console(highlight=False)
+# Where there is no terminal, tables are for files and pipes: wide enough not to wrap.
+console = Console(highlight=False, width=None if sys.stdout.isatty() else 150)
 errors = Console(stderr=True, highlight=False)
 
+PACKAGES = ("can_dbc", "controller", "plant_sim", "tools")
 EXIT_BAD_INPUT = 1
 EXIT_ENDED_EARLY = 3
 EXIT_INTERRUPTED = 130
@@ -57,6 +61,10 @@ COLUMNS = (
     ("energy\nkWh/t", "energy_kwh_per_t", 1, "{:.4f}"),
     ("ticks/s", "ticks_per_s", 1, "{:,.0f}"),
 )
+
+
+# The columns that do not tell how fast the bench was, and the comfort.
+COMPARED = (*COLUMNS[:-1], ("rms jerk\nm/s³", "rms_command_jerk_m_s3", 1, "{:.3f}"))
 
 
 class Screen:
@@ -189,17 +197,18 @@ def run(
         # them.
         environment = {**os.environ, "ATO_HIL_INTERPRETED": "1"}
         os.execve(sys.executable, [sys.executable, "-m", "tools.cli", *sys.argv[1:]], environment)
-    try:
+    with one_line_for_bad_input():
         _run(scenario, law, runs, mode, bus, seed, out, memory, trace)
+
+
+@contextmanager
+def one_line_for_bad_input() -> Iterator[None]:
+    """Bad input of every kind (scenario, law, DBC, bus, memory file) is a ValueError of ours with
+    one line: that line and an exit status, no traceback."""
+    try:
+        yield
     except ValueError as error:
-        # Bad input of every kind (scenario, law, DBC, bus, memory file) is a ValueError of ours
-        # with one line.
-        if type(error).__module__.split(".")[0] not in (
-            "can_dbc",
-            "controller",
-            "plant_sim",
-            "tools",
-        ):
+        if type(error).__module__.split(".")[0] not in PACKAGES:
             raise
         raise _fail(str(error), EXIT_BAD_INPUT) from None
 
@@ -272,6 +281,96 @@ def doctor() -> None:
     console.print(table)
     if any(finding.state == "broken" for finding in findings):
         raise typer.Exit(EXIT_BAD_INPUT)
+
+
+@app.command()
+def compare(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario or a .toml file.")],
+    laws: Annotated[str, typer.Option(help="Laws, separated by commas.")],
+    runs: Annotated[
+        int | None, typer.Option(min=1, help="Runs in a row; the scenario's by default.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of noise and disturbance.")] = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of trace.rrd and compare.json; runs/SCENARIO-compare by default."
+        ),
+    ] = None,
+) -> None:
+    """Run several laws on one scenario (SIL): one table, and one trace with their last runs
+    overlaid."""
+    with one_line_for_bad_input():
+        from plant_sim.scenario import load
+        from tools import compare as side_by_side
+        from tools import session
+
+        loaded = load(scenario)
+        folder = out or Path("runs") / f"{loaded.name}-compare"
+        session.prepare(folder)
+        names = [law.strip() for law in laws.split(",") if law.strip()]
+        with console.status("") as status:
+            rows = side_by_side.compare(
+                loaded,
+                names,
+                runs or loaded.scenario.runs,
+                seed,
+                folder / "trace.rrd",
+                lambda law: status.update(f"{law} ..."),
+            )
+        session.write_json(
+            folder / "compare.json", {"schema": 1, "scenario": loaded.name, "rows": rows}
+        )
+    table = Table("law", *(name for name, key, _f, _s in COMPARED), "faults", header_style="bold")
+    for row in rows:
+        table.add_row(
+            row["law"], *(_cell(row, key, f, s) for _n, key, f, s in COMPARED), _faults(row)
+        )
+    console.print(table)
+    console.print(f"trace   {folder / 'trace.rrd'}", soft_wrap=True)
+
+
+@app.command()
+def claims(
+    paper: Annotated[str, typer.Argument(help="Law that the paper is about: cailc.")],
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the rows to this file as well.")
+    ] = None,
+) -> None:
+    """Measure a paper's claims through the product, row by row."""
+    import importlib
+    import json
+    import pkgutil
+
+    from tools import claims as papers
+    from tools.claims.table import evaluate
+
+    known = sorted({module.name for module in pkgutil.iter_modules(papers.__path__)} - {"table"})
+    if paper not in known:
+        raise _fail(f"no claims of {paper!r}, expected one of {', '.join(known)}", EXIT_BAD_INPUT)
+    if json_file is not None and not json_file.absolute().parent.is_dir():
+        raise _fail(f"{json_file}: no such folder", EXIT_BAD_INPUT)
+    table = Table("claim", "paper", "threshold", "measured", "holds", header_style="bold")
+    rows = []
+    for claim in importlib.import_module(f"tools.claims.{paper}").CLAIMS:
+        row = evaluate(claim)
+        rows.append(row)
+        colour = "green" if row.holds == row.expected else "red"
+        verdict = ("yes" if row.holds else "no") + ("" if row.expected else " (as found)")
+        table.add_row(
+            row.text,
+            row.paper,
+            f"{row.threshold} {row.unit}".strip(),
+            f"{row.measured:.4g} {row.unit}".strip(),
+            f"[{colour}]{verdict}[/]",
+        )
+    console.print(table)
+    if json_file is not None:
+        content = {"schema": 1, "paper": paper, "claims": [row.as_json() for row in rows]}
+        json_file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    surprises = [row.text for row in rows if row.holds != row.expected]
+    if surprises:
+        raise _fail(f"otherwise than found before: {'; '.join(surprises)}", EXIT_BAD_INPUT)
 
 
 @app.command()

@@ -92,7 +92,7 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     runs = setup.run_numbers(law, options.runs or loaded.scenario.runs, learned)
     if runs[-1] > RUNS_MAX:
         raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
-    _prepare(options.out)
+    prepare(options.out)
     listener.begin(loaded, law, runs)
     session = Session(options, loaded, law, runs, listener)
     session.summary = {
@@ -119,11 +119,12 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         session.summary["ended_early"] = "interrupted"
         raise
     finally:
-        _write_summary(options.out / "summary.json", session.summary)
+        write_json(options.out / "summary.json", session.summary)
     return session.summary
 
 
-def _prepare(out: Path) -> None:
+def prepare(out: Path) -> None:
+    """An output folder without what an earlier session left. Raises SessionError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         for name in ("summary.json", "trace.rrd"):
@@ -132,9 +133,10 @@ def _prepare(out: Path) -> None:
         raise SessionError(f"{out}: cannot write there: {error.strerror}") from None
 
 
-def _write_summary(path: Path, summary: dict[str, Any]) -> None:
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Writes a JSON file whole or not at all."""
     temporary = path.with_suffix(".new")
-    temporary.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     os.replace(temporary, path)
 
 

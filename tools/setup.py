@@ -34,6 +34,8 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
             guard_settings=_settings("control.guard", scenario.control.guard, GuardSettings),
             car_effectiveness=list(scenario.train.effectiveness) if distribute else [],
             motor_cars=list(scenario.train.motor_cars),
+            car_traction_max_n=scenario.train.traction_max_n,
+            car_brake_max_n=scenario.train.brake_max_n,
             scenario_digest=loaded.digest,
         )
     except CalibrationError as error:

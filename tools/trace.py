@@ -249,6 +249,7 @@ class TraceWriter:
         estimates: Sequence[str] = (),
         first_run: int = 1,
         last_run: int = 10,
+        names: Sequence[str] = (),
     ) -> None:
         """Create the file and log the reference.
 
@@ -259,6 +260,7 @@ class TraceWriter:
         :param estimates: names, with unit, of the law's estimates 0, 1, …
         :param first_run: number of the first run that is expected, for the colours of the runs.
         :param last_run: number of the last one; more may come.
+        :param names: of the runs, from `first_run` on, where they are not runs of one law.
         :raises TraceError: the file cannot be written, or `cars` is out of range.
         """
         import rerun as rr  # costs a second and 100 MB: only who writes a trace pays for it
@@ -269,6 +271,7 @@ class TraceWriter:
         self._path = path
         self._period_ns = round(period_s * 1e9)
         self._first_run, self._last_run = first_run, last_run
+        self._names = tuple(names)
         self._reference = reference
         self._cars = cars
         self._estimates = tuple(estimates)
@@ -342,7 +345,9 @@ class TraceWriter:
             values = (table[field][:count] - reference[:count])[:, None]
             entity = self._entity(f"truth/{error}", run)
             index = self._index(np.arange(count), run)
-            self._log_scalars(entity, index, values, [f"run {run}"], [self._colour(run)])
+            self._log_scalars(
+                entity, index, values, [self._run_name(run).replace("_", " ")], [self._colour(run)]
+            )
 
     def run_summary(self, run: int, row: dict[str, Any]) -> None:
         """Log a run's row of summary.json: its numbers on timeline `run`, bars, and a table."""
@@ -386,6 +391,8 @@ class TraceWriter:
         return f"{name}/{self._run_name(run)}"
 
     def _run_name(self, run: int) -> str:
+        if self._names:
+            return self._names[run - self._first_run]
         return f"run_{run:0{max(2, len(str(self._last_run)))}}"
 
     def _colour(self, run: int) -> Colour:

@@ -59,6 +59,11 @@ def learned(gains: Gains, vehicle: Vehicle) -> tuple[list[int], list[int], list[
     return initial, [INT32_MIN] * 3, [INT32_MAX] * 3
 
 
+def words_stored(gains: Gains) -> int:
+    """Words that the memory has to store; see `controller/laws/cailc.py`."""
+    return max([q + 1 for q in range(3) if gains.Gamma[q] != 0.0], default=1)
+
+
 @step
 def ailc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
     """One tick of AILC."""

@@ -98,6 +98,15 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
     return params
 
 
+def words_stored(gains: Gains) -> int:
+    """Words that the memory has to store: up to the last with a learning gain, at least one.
+
+    The trajectory repeats, so only Xi' xi is identifiable: one word (Gamma = [1e5, 0, 0]) learns
+    as well as three.
+    """
+    return max([q + 1 for q in range(3) if gains.Gamma[q] != 0.0], default=1)
+
+
 def learned(gains: Gains, vehicle: Vehicle) -> tuple[list[int], list[int], list[int]]:
     """Initial value, lower and upper bound of each learned word."""
     mass = vehicle.mass_kg

@@ -55,6 +55,8 @@ class Cars(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     coupler_cosine_m: list[float]  # amplitude of cos(t)
     coupler_stiffness_n_m: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.0  # of elastic couplers
     coupler_damping_n_s_m: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.0
+    traction_max_n: list[float] = []  # what each car can give; none: as much as CAR_FORCE carries
+    brake_max_n: list[float] = []
 
     def __post_init__(self) -> None:
         cars = len(self.masses_kg)
@@ -66,6 +68,11 @@ class Cars(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
             raise ValueError(f"coupler_sine_m, coupler_cosine_m: expected {cars - 1} numbers each")
         if not self.motor_cars or not all(1 <= car <= cars for car in self.motor_cars):
             raise ValueError(f"motor_cars: expected numbers from 1 to {cars}")
+
+        for key in ("traction_max_n", "brake_max_n"):
+            limits = getattr(self, key)
+            if limits and (len(limits) != cars or min(limits) < 0):
+                raise ValueError(f"{key}: expected {cars} numbers from 0 up, one a car")
 
     @property
     def mass_kg(self) -> float:

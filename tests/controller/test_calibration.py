@@ -57,7 +57,9 @@ def test_the_parameters_hold_the_settings():
     made = calibrate(
         preview_ticks=21,
         memory_settings=MemorySettings(decimation=10, lead_ticks=21, interpolation="linear"),
-        guard_settings=GuardSettings(age_max_ticks=7, service_brake_m_s2=0.5),
+        guard_settings=GuardSettings(
+            age_max_ticks=7, service_brake_m_s2=0.5, overspeed_margin_m_s=0.25
+        ),
     )
     params = made.params[0]
     assert (made.law, made.scenario_digest, made.memory_dtype) == ("cailc", "d" * 32, "int32")
@@ -70,6 +72,7 @@ def test_the_parameters_hold_the_settings():
     guard = params["guard"]
     assert (guard["age_max"], guard["control_age_max"]) == (7, 27)
     assert guard["service_brake"] == -(2**26)
+    assert guard["overspeed_margin"] == 2**22
     memory = params["memory"]
     assert (memory["words"], memory["cells"], memory["decimation"]) == (3, 51, 10)
     assert (memory["lead"], memory["linear"], memory["scale"]) == (21, 1, 1)
@@ -189,6 +192,10 @@ def test_wrong_memory_settings_are_refused_with_their_key(settings, message):
         (
             {"service_brake_m_s2": 20.0},
             "control.guard.service_brake_m_s2: -20 is outside what the firmware holds, +-16",
+        ),
+        (
+            {"overspeed_margin_m_s": 128.0},
+            "control.guard.overspeed_margin_m_s: 128 is outside what the firmware holds, +-128",
         ),
         ({"age_max_ticks": 0}, "control.guard.age_max_ticks is 0, expected 1 to 1000"),
         (

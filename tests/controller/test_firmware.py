@@ -51,8 +51,10 @@ from controller.reference import SEGMENT
 MASS_KG = 200_000.0
 AGE_MAX = 5
 PREVIEW = 3
-# One tick at rest, then a ramp to 2.7 m/s and back: no tick but the first and the last stands.
-PROFILE = np.array([(1, 0), (100, 1800), (100, -1800), (100, -1800), (100, 1800)], SEGMENT)
+MARGIN_M_S = 0.5
+# One tick at rest, two seconds to 1.36 m/s, two back.
+JERK = 250_000
+PROFILE = np.array([(1, 0), (100, JERK), (200, -JERK), (100, JERK)], SEGMENT)
 GAINS = {"kp": 1e5, "kD": 0.0, "gp": 3e5, "gI": 0.0, "gD": 0.0}
 
 
@@ -65,7 +67,9 @@ def calibrated():
         profile=PROFILE,
         preview_ticks=PREVIEW,
         memory_settings=MemorySettings(decimation=4),
-        guard_settings=GuardSettings(age_max_ticks=AGE_MAX, service_brake_m_s2=0.5),
+        guard_settings=GuardSettings(
+            age_max_ticks=AGE_MAX, service_brake_m_s2=0.5, overspeed_margin_m_s=MARGIN_M_S
+        ),
         car_effectiveness=[1.0, 1.0, 1.0],
         motor_cars=[1, 3],
         scenario_digest="d" * 32,
@@ -414,16 +418,32 @@ def test_a_jump_of_the_tick_is_reported(running, jump):
     assert running.core["guard"] == GUARD_NORMAL
 
 
-def test_overspeed_coasts(running):
-    running.run_tick(speed=1.0, permitted=1.0)
+@pytest.mark.parametrize("permitted", [0.01, 0.7, 1.0, 22.6, 163.83])
+def test_overspeed_is_reported_from_the_first_step_of_the_sensor(running, permitted):
+    step = TRAIN_SPEED.Speed.scale
+    allowed = min(int(permitted / step) * step, 127.9)
+    running.run_tick(speed=allowed, permitted=permitted)
     assert running.core["faults"] == 0
-    for _ in range(100):
-        running.run_tick()
-    word = running.run_tick(speed=1.01, permitted=1.0)[FORCE_CMD.name]
-    assert running.core["faults"] == FAULT_OVERSPEED
-    assert running.core["guard"] == GUARD_COAST
-    assert running.inputs["limited"] == int(running.inputs["reference_speed"] > 1.01 * 2**24)
-    assert get(word, FORCE_CMD.Force) <= 0
+    if permitted < 127:
+        running.run_tick(speed=allowed + step, permitted=permitted)
+        assert running.core["faults"] == FAULT_OVERSPEED
+        assert running.core["guard"] == GUARD_NORMAL
+
+
+def test_above_the_margin_traction_is_cut(bench):
+    bench.start()
+    while bench.inputs["reference_speed"] < 1 << 24:
+        bench.run_tick()
+    # The law wants more speed, the limit has fallen.
+    at_margin = bench.run_tick(speed=0.75, permitted=0.25)[FORCE_CMD.name]
+    assert (bench.core["guard"], bench.inputs["limited"]) == (GUARD_NORMAL, 0)
+    assert get(at_margin, FORCE_CMD.Mode) == TRACTION
+    above = bench.run_tick(speed=0.76, permitted=0.25)[FORCE_CMD.name]
+    assert (bench.core["guard"], bench.inputs["limited"]) == (GUARD_COAST, 1)
+    assert (get(above, FORCE_CMD.Force), get(above, FORCE_CMD.Mode)) == (0, COAST)
+    bench.run_tick(speed=0.2, permitted=0.25)
+    assert bench.core["guard"] == GUARD_NORMAL
+    assert bench.core["faults"] == FAULT_OVERSPEED
 
 
 def test_a_limited_command_is_told_to_the_law(running):

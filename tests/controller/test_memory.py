@@ -20,7 +20,7 @@ INT32 = st.integers(-(2**31), 2**31 - 1)
 @step
 def run_ticks(params: Any, state: Any, stored: Any, cell: Any, learn: Any, before: Any) -> None:
     """One run: learn [ticks, words] goes in, before [ticks, words] comes out."""
-    memory.rewind(params[0], state[0])
+    memory.rewind(params[0], state[0], cell[0])
     for k in range(len(learn)):
         memory.gather(params[0], state[0], stored, cell[0])
         for w in range(learn.shape[1]):

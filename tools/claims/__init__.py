@@ -1,0 +1,1 @@
+"""What the papers claim, measured through the product: one file a paper, one row a claim."""
