@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -45,7 +46,7 @@ def ato_hil(*arguments: str, cwd: Path, **environment: str) -> subprocess.Comple
         env={**os.environ, **environment},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
         check=False,
     )
 
@@ -275,3 +276,25 @@ def test_two_sessions_do_not_share_a_bus(tmp_path: Path) -> None:
     finally:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
+
+
+@pytest.mark.long
+def test_the_paper_s_figures_come_over_the_bus(tmp_path: Path) -> None:
+    """Row A1 with separate processes, and the digest of SIL."""
+    arguments = ("run", "subway-paper", "--no-trace")
+    hil = ato_hil(*arguments, "--bus", channel(tmp_path), "--out", "hil", cwd=tmp_path)
+    assert hil.returncode == 0, hil.stderr
+    sil = ato_hil(*arguments, "--mode", "sil", "--out", "sil", cwd=tmp_path)
+    found = summary(tmp_path / "hil")
+    assert sil.returncode == 0, sil.stderr
+    assert found["digest"] == summary(tmp_path / "sil")["digest"]
+    runs = found["runs"]
+    assert len(runs) == 10
+    assert 0.0650 <= max(row["max_delta_m_s"] for row in runs) <= 0.0680
+    assert 3.75e-3 <= max(row["max_speed_error_m_s"] for row in runs) <= 4.00e-3
+    assert 8.15e-3 <= max(row["max_position_error_m"] for row in runs) <= 8.50e-3
+    assert max(row["max_acceleration_m_s2"] for row in runs) <= 1.0
+    assert min(row["overspeed_margin_m_s"] for row in runs) >= 0.15
+    rms = [row["rms_delta_m_s"] for row in runs]
+    assert all(b < a for a, b in pairwise(rms))
+    assert runs[9]["max_delta_m_s"] <= 0.0625

@@ -1,0 +1,103 @@
+"""The commands that do not run a session: list, doctor, compare, claims."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from plant_sim.scenario import scenario_names
+
+SHORT = """
+base = "subway-fast"
+title = "A short run between two stops"
+runs = 2
+
+[profile]
+duration_s = 20.0
+distance_m = 45.0
+max_speed_m_s = 5.0
+ramps = [
+    { to_m_s = "solved", start_s = 1.0, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 },
+    { to_m_s = 0.0, end_s = 18.0, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 },
+]
+"""
+
+
+def ato_hil(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "tools.cli", *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
+    )
+
+
+def test_list_names_every_scenario(tmp_path: Path) -> None:
+    done = ato_hil("list", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for name in scenario_names():
+        assert name in done.stdout
+
+
+def test_doctor_finds_this_machine_fit(tmp_path: Path) -> None:
+    done = ato_hil("doctor", cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for what in ("compiler", "compiler cache", "DBC", "bus hub", "bus socketcan:vcan0", "viewer"):
+        assert what in done.stdout
+    assert "broken" not in done.stdout
+
+
+def test_compare_lays_laws_side_by_side(tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text(SHORT)
+    done = ato_hil("compare", "short.toml", "--laws", "cailc,pid", "--out", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "out" / "compare.json").read_text())["rows"]
+    assert [(row["law"], row["run"]) for row in rows] == [
+        ("cailc", 1),
+        ("cailc", 2),
+        ("pid", 1),
+        ("pid", 2),
+    ]
+    assert rows[1]["rms_position_error_m"] < rows[0]["rms_position_error_m"]
+    assert rows[2]["max_position_error_m"] > 10 * rows[0]["max_position_error_m"]
+    from rerun.chunk import RrdReader
+
+    entities = {
+        str(chunk.entity_path) for chunk in RrdReader(tmp_path / "out" / "trace.rrd").stream()
+    }
+    assert "/truth/position_error_m/cailc" in entities
+    assert "/truth/position_error_m/pid" in entities
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["compare", "subway", "--laws", "cailc,magic"], "no gains for law 'magic'"),
+        (["compare", "nowhere", "--laws", "cailc"], "scenario 'nowhere' is unknown"),
+        (["claims", "nothing"], "no claims of 'nothing', expected one of cailc"),
+        (["claims", "cailc", "--json", "no/such/file.json"], "no/such/file.json: no such folder"),
+    ],
+)
+def test_bad_input_is_one_clear_line(tmp_path: Path, arguments: list[str], says: str) -> None:
+    done = ato_hil(*arguments, cwd=tmp_path)
+    assert done.returncode == 1
+    assert says in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.long
+def test_the_claims_of_paper_1_come_out_as_found(tmp_path: Path) -> None:
+    done = ato_hil("claims", "cailc", "--json", "claims.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "claims.json").read_text())["claims"]
+    assert len(rows) >= 20
+    assert all(row["holds"] == row["expected"] for row in rows)
+    assert any(not row["holds"] for row in rows)
+    assert all(math.isfinite(row["measured"]) for row in rows)
