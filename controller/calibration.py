@@ -9,6 +9,8 @@ the controller process needs nothing else.
 from __future__ import annotations
 
 import json
+import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,8 +65,8 @@ def calibrate(
     guard_settings: GuardSettings,
     car_effectiveness: list[float],
     motor_cars: list[int],
-    car_traction_max_n: list[float],
-    car_brake_max_n: list[float],
+    car_traction_max_n: Sequence[float] = (),
+    car_brake_max_n: Sequence[float] = (),
     scenario_digest: str,
 ) -> Calibration:
     """PARAMS of the firmware for one law on one scenario. Raises CalibrationError or LawError with
@@ -93,7 +95,10 @@ def calibrate(
         raise CalibrationError(f"laws.{law}: {error}") from None
     if car_effectiveness:
         params["distribution"] = distribution.calibrate(
-            car_effectiveness, motor_cars, car_traction_max_n or None, car_brake_max_n or None
+            car_effectiveness,
+            motor_cars,
+            list(car_traction_max_n) or None,
+            list(car_brake_max_n) or None,
         )
     return Calibration(law, scenario_digest, params, profile, memory_settings.storage)
 
@@ -180,7 +185,7 @@ def load(path: Path) -> Calibration:
             head = json.loads(archive["head"].tobytes())
             params_bytes = archive["params"].tobytes()
             profile_bytes = archive["profile"].tobytes()
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise CalibrationError(f"{path}: not a calibration file ({error})") from None
     if head.get("format") != FORMAT:
         raise CalibrationError(f"{path}: format {head.get('format')!r}, expected {FORMAT!r}")

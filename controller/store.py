@@ -99,5 +99,7 @@ def load(path: Path, calibration: Calibration) -> Stored:
             f"{path}: {cells} cells of {words} words of {width} bytes,"
             f" expected {shape[0]} of {shape[1]} of {dtype.itemsize}"
         )
+    if len(body) != _HEADER.size + cells * words * width:
+        raise MemoryFileError(f"{path}: its size is not that of {cells} cells of {words} words")
     data = np.frombuffer(body, dtype, cells * words, _HEADER.size).reshape(cells, words)
     return Stored(data.copy(), iteration)

@@ -38,6 +38,8 @@ def calibrate(**changes):
         "guard_settings": GuardSettings(),
         "car_effectiveness": [],
         "motor_cars": [],
+        "car_traction_max_n": [],
+        "car_brake_max_n": [],
         "scenario_digest": "d" * 32,
     }
     return calibration.calibrate(**settings | changes)
@@ -99,9 +101,19 @@ def test_int16_has_the_upper_half_of_a_word():
     assert made.params[0]["memory"]["scale"] == 2**16
 
 
+def test_words_that_do_not_learn_are_not_stored():
+    params = calibrate(gains=CAILC | {"Gamma": [1e5, 0.0, 0.0]}).params[0]["memory"]
+    assert params["words"] == 1
+    assert params["initial"][1] == round(172.808613 / 194295.0 * 2**39)
+
+
 def test_cars_get_their_distribution():
     made = calibrate(car_effectiveness=[1.0, 0.5], motor_cars=[2])
     assert made.params["distribution"] == distribution.calibrate([1.0, 0.5], [2])
+    limits = {"car_traction_max_n": [0.0, 6e4], "car_brake_max_n": [5e4, 5e4]}
+    made = calibrate(car_effectiveness=[1.0, 0.5], motor_cars=[2], **limits)
+    expected = distribution.calibrate([1.0, 0.5], [2], *limits.values())
+    assert made.params["distribution"] == expected
 
 
 # What is refused.

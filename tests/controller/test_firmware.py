@@ -72,6 +72,8 @@ def calibrated():
         ),
         car_effectiveness=[1.0, 1.0, 1.0],
         motor_cars=[1, 3],
+        car_traction_max_n=[],
+        car_brake_max_n=[],
         scenario_digest="d" * 32,
     )
 

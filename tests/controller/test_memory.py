@@ -218,8 +218,9 @@ def test_a_dropped_run_leaves_no_trace():
 
 def test_a_run_that_ends_early_keeps_the_rest():
     mine = Memory(settings_of(cells=4, initial=9))
-    mine.run([1, 1])
-    assert mine.values == [[10], [10], [9], [9]]
+    mine.run([1, 2, 3, 4])
+    mine.run([5, 5])
+    assert mine.values == [[15], [16], [12], [13]]
 
 
 def test_values_stay_between_their_bounds():
@@ -243,6 +244,14 @@ def test_int16_starts_from_the_nearest_value():
 def test_int16_takes_half_the_bytes():
     params = settings_of(words=3, cells=10, scale=2**16)
     assert Memory(params, np.int16).stored.nbytes * 2 == Memory(params).stored.nbytes == 240
+
+
+def test_words_that_are_not_stored_keep_their_first_value():
+    params = settings_of(words=1, cells=2, initial=5)
+    state, cell = np.zeros(1, MEMORY_STATE), np.zeros(1, CELL)
+    before, learn = np.zeros((2, 1), np.int64), np.ones((2, 1), np.int64)
+    run_ticks(params, state, memory.initial_memory(params[0]), cell, learn, before)
+    assert cell["before"][0].tolist() == [5] * WORDS_MAX
 
 
 def test_a_law_without_words_uses_no_memory():

@@ -195,6 +195,13 @@ def test_first_values_lie_between_the_bounds(vehicle):
 
 
 @pytest.mark.parametrize(
+    ("gamma", "words"), [((1e5, 0.0, 0.0), 1), ((1.0, 0.0, 1e-3), 3), ((0.0, 1.0, 0.0), 2)]
+)
+def test_words_are_stored_up_to_the_last_that_learns(gamma, words):
+    assert cailc.words_stored(cailc.Gains(**PAPER | {"Gamma": gamma})) == words
+
+
+@pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ({"alpha": 4e4}, "alpha: 40000 is outside what the firmware holds, +-32768"),

@@ -88,9 +88,9 @@ def test_learning_in_the_memory_adds_the_errors_of_all_runs(vehicle, inputs_of, 
     runs = [wandering(ticks, seed, 1e-4) for seed in (5, 6, 7)]
     forces = []
     for iteration, eps in enumerate(runs):
-        memory.start_run(state[0], stored)
-        memory.rewind(grid[0], state[0])
         cells = np.zeros(ticks, CELL)
+        memory.start_run(state[0], stored)
+        memory.rewind(grid[0], state[0], cells[0])
         cells["before"][:, 0] = stored[state["generation"][0], :, 0]
         inputs = run_inputs(inputs_of, iteration, eps)
         outputs, cells, _ = run_law("pdilc", params, inputs, None, cells)

@@ -1,0 +1,153 @@
+"""Accuracy: a law in fixed point against the same law in float64, inside the same firmware.
+
+A pair law runs both on the inputs of every tick. First the fixed-point law drives and the
+reference follows in its shadow, learning from the same inputs: the largest difference of the
+force. Then the reference drives: the largest difference of position and speed between the two
+closed loops.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from can_dbc.codec import mailboxes
+from can_dbc.step import step
+from controller import firmware, memory, node
+from controller.calibration import Calibration
+from controller.interface import FAULTS_THAT_BLOCK_LEARNING
+from controller.quantise import Vehicle
+from controller.registry import law_step, load_law
+from plant_sim.scenario import Loaded, load
+from tools import setup, sil
+from tools.verify import FAILED, Row, identity, row
+from tools.verify.references import REFERENCES, Reference, state_dtype
+
+RUNS = 3
+
+
+def build_pair(fixed: Any, reference: Any) -> Any:
+    """A law that calls both; `params.drive` 1 lets the reference drive."""
+
+    @step
+    def pair(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+        fixed(params.fixed, state.fixed, cell, inputs, outputs)
+        force = reference(params.real, state.real, inputs)
+        difference = abs(outputs.force * 2.0**-27 - force)
+        if difference > state.difference:
+            state.difference = difference
+        if params.drive == 1:
+            outputs.force = math.floor(force * 2.0**27 + 0.5)
+
+    return pair
+
+
+def params_dtype(module: ModuleType, reference: Reference) -> np.dtype:
+    """Params of the pair."""
+    real = np.dtype([(name, np.float64) for name in reference.names])
+    return np.dtype([("real", real), ("fixed", module.PARAMS), ("drive", np.int32)], align=True)
+
+
+def pair_state_dtype(module: ModuleType, reference: Reference, ticks: int) -> np.dtype:
+    """State of the pair."""
+    real = state_dtype(reference.words, ticks)
+    return np.dtype(
+        [("real", real), ("difference", np.float64), ("fixed", module.STATE)], align=True
+    )
+
+
+def check(law: str) -> Iterator[Row]:
+    """Rows of force, position and speed for one law."""
+    reference = REFERENCES.get(law)
+    if reference is None:
+        yield Row(
+            "accuracy",
+            law,
+            "fixed point against float64",
+            "no float64 reference in references.py",
+            FAILED,
+        )
+        return
+    scenario = identity.scenario_of(law)
+    force_n, position_m, speed_m_s = differences(law, reference, load(scenario))
+    how = f"{scenario}, {RUNS} runs, against float64"
+    yield _row("force", law, f"{how} on the same inputs", force_n, reference.force_n, "N", 1)
+    yield _row(
+        "position", law, f"{how} in closed loop", position_m, reference.position_m, "µm", 1e6
+    )
+    yield _row("speed", law, f"{how} in closed loop", speed_m_s, reference.speed_m_s, "µm/s", 1e6)
+
+
+def _row(
+    what: str, law: str, how: str, value: float, bound: float, unit: str, factor: float
+) -> Row:
+    text = f"largest difference {value * factor:.3g} {unit}, bound {bound * factor:g}"
+    return row(f"accuracy of the {what}", law, how, text, value <= bound)
+
+
+def differences(law: str, reference: Reference, loaded: Loaded) -> tuple[float, float, float]:
+    """Largest differences of force (N), position (m), speed (m/s) between a law and a reference."""
+    module = load_law(law)
+    calibration = setup.calibration_for(loaded, law)
+    shadow, truth = _runs(module, reference, loaded, calibration, drive=0)
+    _follows, real = _runs(module, reference, loaded, calibration, drive=1)
+    mass = loaded.scenario.train.mass_kg
+    return (
+        shadow * mass,
+        float(np.max(np.abs(truth["position_m"] - real["position_m"]))),
+        float(np.max(np.abs(truth["speed_m_s"] - real["speed_m_s"]))),
+    )
+
+
+def _runs(
+    module: ModuleType, reference: Reference, loaded: Loaded, calibration: Calibration, drive: int
+) -> tuple[float, np.ndarray]:
+    """Largest difference of the force (m/s^2), and the plant's truth of all runs."""
+    scenario = loaded.scenario
+    gains = msgspec.convert(scenario.laws[calibration.law], module.Gains, strict=False)
+    vehicle = Vehicle(
+        scenario.train.mass_kg * (1.0 + scenario.control.mass_error),
+        scenario.period_s,
+        scenario.actuator.force_max_m_s2,
+    )
+    params = np.zeros(1, firmware.params_dtype(params_dtype(module, reference)))
+    for part in params.dtype.names or ():
+        if part != "law":
+            params[part] = calibration.params[part]
+    params["law"]["fixed"] = calibration.params["law"]
+    params["law"]["real"] = reference.params(gains, vehicle)
+    params["law"]["drive"] = drive
+
+    state = np.zeros(1, firmware.state_dtype(pair_state_dtype(module, reference, loaded.ticks)))
+    state["links"]["counter"] = -1
+    if reference.words:
+        state["law"]["real"]["memory"] = reference.initial(gains, vehicle) or 0.0
+    tick = firmware.build_tick(build_pair(law_step(module), reference.force))
+    controller = node.Controller(
+        calibration=calibration,
+        tick=tick,
+        call=node.callable_tick(tick),
+        params=params,
+        profile=calibration.profile,
+        state=state,
+        cells=memory.initial_memory(calibration.params[0]["memory"]),
+        rx=mailboxes(),
+        tx=mailboxes(),
+        memory_file=None,
+    )
+    numbers = setup.run_numbers(calibration.law, RUNS)
+    truth = []
+    kept = state["law"]["real"]["memory"].copy()
+    for result, _node in sil.run_controller(loaded, controller, runs=numbers, seed=identity.SEED):
+        truth.append(result.truth)
+        # As the firmware does: a run with a fault leaves no trace in what is learned.
+        if int(state["core"]["faults"][0]) & FAULTS_THAT_BLOCK_LEARNING:
+            state["law"]["real"]["memory"] = kept
+        else:
+            kept = state["law"]["real"]["memory"].copy()
+    return float(state["law"]["difference"][0]), np.concatenate(truth)

@@ -1,0 +1,298 @@
+"""Cost per tick: of each part of the firmware's tick, of each law, and against the same algorithm
+in C.
+
+Python and C run the same rows in turns in one process; the smallest of many rounds counts, which
+other load on the machine can only make larger. Where there is a C twin, its results are compared
+bit for bit as well.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from can_dbc import codec, e2e
+from can_dbc.codec import FORCE_CMD, TRAIN_SPEED
+from can_dbc.step import int64, step
+from controller import distribution, firmware, guard, memory, node, q, reference
+from controller.interface import INPUTS, OUTPUTS, RUNNING
+from controller.memory import CELL
+from controller.registry import law_step, load_law
+from plant_sim.scenario import load
+from tools import setup
+from tools.verify import ABSENT, FAILED, Row, identity, overflow, row
+from tools.verify.instructions import C_FOLDER, ToolError
+
+ROWS = 2000  # a loop; its data stay in the cache
+ROUNDS = 200
+RATIO_MAX = 1.3
+C_LAWS = ("pid", "cailc")
+C_FLAGS = ("-O2", "-std=c11", "-Wall", "-Werror", "-shared", "-fPIC")
+
+
+def fastest_ns(calls: list[Callable[[], Any]], rounds: int = ROUNDS) -> list[float]:
+    """ns a row of each of these loops over ROWS rows: the smallest of `rounds`, taken in turns."""
+    best = [float("inf")] * len(calls)
+    for _ in range(rounds):
+        for k, call in enumerate(calls):
+            started = time.perf_counter_ns()
+            call()
+            best[k] = min(best[k], (time.perf_counter_ns() - started) / ROWS)
+    return best
+
+
+def build_law_loop(law: Any) -> Any:
+    """A loop of one law over rows of inputs."""
+
+    @step
+    def loop(n: Any, params: Any, state: Any, cells: Any, inputs: Any, outputs: Any) -> None:
+        for k in range(n):
+            law(params[0], state[0], cells[k], inputs[k], outputs[k])
+
+    return loop
+
+
+def law_records(law: str) -> list[np.ndarray]:
+    """Params as calibrated, zero state, and ROWS rows of cells, inputs in the range of a train,
+    outputs."""
+    random = np.random.default_rng(overflow.SEARCH_SEED)
+    inputs = np.zeros(ROWS, INPUTS)
+    inputs["tick"] = np.arange(ROWS)
+    inputs["iteration"] = 1
+    inputs["position"] = inputs["reference_position"] = random.integers(0, 3512 << 15, ROWS)
+    inputs["position"] += random.integers(-400, 400, ROWS).astype(np.int32)
+    inputs["speed"] = inputs["reference_speed"] = random.integers(0, 22 << 24, ROWS)
+    inputs["speed"] += random.integers(-(1 << 20), 1 << 20, ROWS).astype(np.int32)
+    inputs["ahead_acceleration"] = random.integers(-(1 << 27), 1 << 27, ROWS)
+    cells = np.zeros(ROWS, CELL)
+    cells["before"] = random.integers(0, 1 << 28, (ROWS, memory.WORDS_MAX))
+    state = np.zeros(1, load_law(law).STATE)
+    return [overflow.calibrated(law)[0], state, cells, inputs, np.zeros(ROWS, OUTPUTS)]
+
+
+def check_law(law: str) -> Iterator[Row]:
+    """Cost of a law's step; for the laws that have a C twin, the ratio to it."""
+    loop = build_law_loop(law_step(load_law(law)))
+    mine = law_records(law)
+    if law not in C_LAWS:
+        (ns,) = fastest_ns([lambda: loop(ROWS, *mine)])
+        yield row("cost", law, f"law step, fastest of {ROUNDS} rounds", f"{ns:.1f} ns a tick", True)
+        return
+    how = "against C, gcc -O2, same rows, in turns"
+    if shutil.which("gcc") is None:
+        yield Row("cost", law, how, "this machine has no gcc", ABSENT)
+        return
+    try:
+        theirs = law_records(law)
+        twin = _twin(law, f"{law}_loop")
+        call = _bound(twin, *theirs)
+        yield _ratio(law, how, lambda: loop(ROWS, *mine), call, [mine, theirs])
+    except ToolError as error:
+        yield Row("cost", law, how, str(error), FAILED)
+
+
+def _ratio(subject: str, how: str, mine: Any, theirs: Any, results: list[list[np.ndarray]]) -> Row:
+    mine()
+    theirs()
+    if any(a.tobytes() != b.tobytes() for a, b in zip(*results, strict=True)):
+        return Row("cost", subject, how, "the C twin gives other bits", FAILED)
+    ns, c_ns = fastest_ns([mine, theirs])
+    ratio = ns / c_ns
+    text = f"{ns:.1f} ns a tick, C {c_ns:.1f} ns, ratio {ratio:.2f}, bound {RATIO_MAX}"
+    return row("cost", subject, how, text, ratio <= RATIO_MAX)
+
+
+# Codec and end-to-end check.
+
+
+@step
+def codec_loop(n: Any, words: Any, out: Any) -> None:
+    """TRAIN_SPEED decoded, FORCE_CMD encoded."""
+    for k in range(n):
+        speed = codec.get(words[k], TRAIN_SPEED.Speed)
+        quality = codec.get(words[k], TRAIN_SPEED.Quality)
+        out[k] = (
+            codec.put(FORCE_CMD.Force, codec.saturate(FORCE_CMD.Force, speed))
+            + codec.put(FORCE_CMD.Mode, quality)
+            + codec.put(FORCE_CMD.Tick, k & 0xFFFF)
+        )
+
+
+@step
+def e2e_loop(n: Any, words: Any, out: Any) -> None:
+    """Each word protected, then checked as a receiver does."""
+    counter = int64(0)
+    last = int64(-1)
+    for k in range(n):
+        word = e2e.protect(words[k], counter, FORCE_CMD.data_id)
+        counter = e2e.next_counter(counter)
+        out[k] = word + e2e.check(word, last, FORCE_CMD.data_id)
+        last = (word >> 8) & 15
+
+
+def check_frames() -> Iterator[Row]:
+    """Codec and end-to-end check against C."""
+    how = "against C, gcc -O2, same words, in turns"
+    if shutil.which("gcc") is None:
+        yield Row("cost", "codec, e2e", how, "this machine has no gcc", ABSENT)
+        return
+    words = np.random.default_rng(overflow.SEARCH_SEED).integers(-(2**63), 2**63, ROWS) & ~0xFFFF
+    table = np.zeros((8, 256), np.int16)
+    table[:7], table[7] = e2e._CRC.reshape(7, 256), e2e._CRC_DATA_ID
+    data_id = ctypes.c_int64(FORCE_CMD.data_id)
+    mine, theirs = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64)
+    try:
+        twin = _bound(_twin("frames", "codec_loop"), words, theirs)
+        yield _ratio("codec", how, lambda: codec_loop(ROWS, words, mine), twin, [[mine], [theirs]])
+        twin = _bound(_twin("frames", "e2e_loop"), table, data_id, words, theirs)
+        yield _ratio("e2e", how, lambda: e2e_loop(ROWS, words, mine), twin, [[mine], [theirs]])
+    except ToolError as error:
+        yield Row("cost", "codec, e2e", how, str(error), FAILED)
+
+
+def _definitions() -> list[str]:
+    """What the C twins take from the DBC and from controller/q.py."""
+    places = {
+        "SPEED": TRAIN_SPEED.Speed,
+        "QUALITY": TRAIN_SPEED.Quality,
+        "FORCE": FORCE_CMD.Force,
+        "MODE": FORCE_CMD.Mode,
+        "TICK": FORCE_CMD.Tick,
+    }
+    defined = [f"-DSIN_{n}={getattr(q, f'_SIN_{n}')}" for n in (1, 3, 5, 7)]
+    for name, signal in places.items():
+        defined += [
+            f"-D{name}_START={signal.start}",
+            f"-D{name}_LENGTH={signal.length}",
+            f"-D{name}_SIGNED={signal.is_signed}",
+        ]
+    return defined
+
+
+def _twin(name: str, function: str) -> Any:
+    """A function of c/NAME.c, compiled. Raises ToolError."""
+    with tempfile.TemporaryDirectory(prefix="ato-hil-verify-") as scratch:
+        library = Path(scratch) / f"{name}.so"
+        process = subprocess.run(
+            ["gcc", *C_FLAGS, *_definitions(), "-o", str(library), str(C_FOLDER / f"{name}.c")],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if process.returncode != 0:
+            raise ToolError(f"gcc: {(process.stderr.strip().splitlines() or ['no message'])[-1]}")
+        return getattr(ctypes.CDLL(str(library)), function)
+
+
+def _bound(function: Any, *arguments: Any) -> Callable[[], Any]:
+    """The C loop with its arguments, arrays by address."""
+    native = [
+        a.ctypes.data_as(ctypes.c_void_p) if isinstance(a, np.ndarray) else a for a in arguments
+    ]
+    return lambda: function(ctypes.c_int64(ROWS), *native)
+
+
+# Parts of the tick.
+
+
+@step
+def read_inputs_loop(n: Any, state: Any, rx: Any) -> None:
+    """Three frames received: decoded and checked end to end."""
+    for _ in range(n):
+        firmware.read_inputs(state[0], rx)
+
+
+@step
+def reference_loop(n: Any, params: Any, profile: Any, state: Any) -> None:
+    """Both cursors read and moved on."""
+    for _ in range(n):
+        firmware.read_reference(params[0], state[0])
+        reference.advance(params[0].reference, state[0].cursor, profile)
+        reference.advance(params[0].reference, state[0].ahead, profile)
+
+
+@step
+def memory_loop(n: Any, params: Any, state: Any, cells: Any) -> None:
+    """Gather and scatter, from the start of a run."""
+    memory.rewind(params[0].memory, state[0].memory)
+    for _ in range(n):
+        memory.gather(params[0].memory, state[0].memory, cells, state[0].cell)
+        memory.scatter(params[0].memory, state[0].memory, cells, state[0].cell)
+
+
+@step
+def guard_loop(n: Any, params: Any, state: Any) -> None:
+    """Faults of inputs and motion, state of the guard, limit of the force."""
+    core = state[0].core
+    for k in range(n):
+        faults = guard.faults_of_inputs(params[0].guard, k & 3, k & 7, k & 3, k & 15, k & 1)
+        faults = faults | guard.faults_of_motion(k, int64(core.permitted_speed), int64(0))
+        core.force = guard.limited(params[0].guard, guard.state_of(faults), int64(core.force))
+
+
+@step
+def distribution_loop(n: Any, params: Any, state: Any) -> None:
+    """The force of every car."""
+    for k in range(n):
+        distribution.distribute(params[0].distribution, (k - 1000) << 11, state[0].core.car_force)
+
+
+@step
+def send_loop(n: Any, state: Any, tx: Any) -> None:
+    """One frame encoded and protected."""
+    for k in range(n):
+        word = codec.put(FORCE_CMD.Force, k) + codec.put(FORCE_CMD.Tick, k)
+        firmware.send(state[0].core, tx, FORCE_CMD, word)
+
+
+def build_tick_loop(tick: Any) -> Any:
+    """The whole tick over one set of mailboxes."""
+
+    @step
+    def loop(n: Any, params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any) -> None:
+        for _ in range(n):
+            tick(params[0], profile, state[0], cells, rx, tx, 1)
+
+    return loop
+
+
+def check_parts(law: str) -> Iterator[Row]:
+    """Cost of each part of the tick and of the whole, with one law."""
+    scenario = identity.scenario_of(law)
+    here = node.build(setup.calibration_for(load(scenario), law))
+    here.rx["fresh"] = 1
+    params, profile, state, cells = here.params, here.profile, here.state, here.cells
+
+    def begin() -> None:
+        """A run from its start; every mailbox holds a frame that its receiver refuses."""
+        state["core"]["run_state"] = RUNNING
+        state["core"]["tick"] = 0
+        memory.rewind(params[0]["memory"], state[0]["memory"])
+
+    tick = build_tick_loop(here.tick)
+
+    def whole() -> None:
+        tick(ROWS, params, profile, state, cells, here.rx, here.tx)
+
+    parts: dict[str, Callable[[], Any]] = {
+        "receive 3 frames": lambda: read_inputs_loop(ROWS, state, here.rx),
+        "reference": lambda: reference_loop(ROWS, params, profile, state),
+        "learning memory": lambda: memory_loop(ROWS, params, state, cells),
+        "guard": lambda: guard_loop(ROWS, params, state),
+        "distribution": lambda: distribution_loop(ROWS, params, state),
+        "send 1 frame": lambda: send_loop(ROWS, state, here.tx),
+        "whole tick": whole,
+    }
+    begin()
+    for name, ns in zip(parts, fastest_ns(list(parts.values())), strict=True):
+        yield row(
+            "cost", f"{name}, {law}", f"fastest of {ROUNDS} rounds", f"{ns:.1f} ns a tick", True
+        )
