@@ -18,12 +18,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from controller import distribution, firmware, memory, reference
-from controller.q import Q_FORCE, Q_SPEED
+from controller import distribution, firmware, guard, memory, reference
+from controller.q import Q_ACCELERATION, Q_FORCE, Q_SPEED
 from controller.quantise import CalibrationError, Vehicle, fixed
 from controller.registry import law_number, load_law
 
 FORMAT = "ato-hil calibration 1"
+AGE_MAX_TICKS = 1000
 
 
 class MemorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -72,38 +73,54 @@ def calibrate(
     """PARAMS of the firmware for one law on one scenario. Raises CalibrationError or LawError with
     one line."""
     module = load_law(law)
-    try:
-        typed = msgspec.convert(gains, module.Gains, strict=False)
-    except msgspec.ValidationError as error:
-        raise CalibrationError(f"laws.{law}: {error}") from None
     params = np.zeros(1, firmware.params_dtype(module.PARAMS))
+    params["core"] = _core(module, law, vehicle)
     try:
+        typed = msgspec.convert(gains, module.Gains)
         params["law"] = module.calibrate(typed, vehicle)
-        params["core"] = _core(module, law, vehicle)
-        params["guard"]["age_max"] = guard_settings.age_max_ticks
-        params["guard"]["control_age_max"] = guard_settings.age_max_ticks + 20
-        params["guard"]["service_brake"] = fixed(
-            "guard.service_brake_m_s2", -abs(guard_settings.service_brake_m_s2), 27
-        )
-        params["guard"]["overspeed_margin"] = fixed(
-            "guard.overspeed_margin_m_s", guard_settings.overspeed_margin_m_s, Q_SPEED
-        )
-        params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
-        ticks = int(profile["ticks"].sum()) + 1
-        params["memory"] = _memory(module, typed, vehicle, memory_settings, ticks)
-    except CalibrationError as error:
+        words = _words(module, typed, vehicle)
+    except (msgspec.ValidationError, CalibrationError) as error:
         raise CalibrationError(f"laws.{law}: {error}") from None
+    params["guard"] = _guard(guard_settings)
+    params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
+    ticks = int(profile["ticks"].sum()) + 1
+    params["memory"] = _memory(words, memory_settings, ticks)
     if car_effectiveness:
-        params["distribution"] = distribution.calibrate(
-            car_effectiveness,
-            motor_cars,
-            list(car_traction_max_n) or None,
-            list(car_brake_max_n) or None,
-        )
+        try:
+            params["distribution"] = distribution.calibrate(
+                car_effectiveness,
+                motor_cars,
+                list(car_traction_max_n) or None,
+                list(car_brake_max_n) or None,
+            )
+        except CalibrationError as error:
+            raise CalibrationError(f"train.{error}") from None
     return Calibration(law, scenario_digest, params, profile, memory_settings.storage)
 
 
+def _guard(settings: GuardSettings) -> np.ndarray:
+    params = np.zeros(1, guard.PARAMS)
+    age = _whole("control.guard.age_max_ticks", settings.age_max_ticks, 1, AGE_MAX_TICKS)
+    params["age_max"] = age
+    params["control_age_max"] = age + 20
+    params["service_brake"] = fixed(
+        "control.guard.service_brake_m_s2", -abs(settings.service_brake_m_s2), Q_ACCELERATION
+    )
+    params["overspeed_margin"] = fixed(
+        "control.guard.overspeed_margin_m_s", settings.overspeed_margin_m_s, Q_SPEED
+    )
+    return params
+
+
+def _whole(key: str, value: int, low: int, high: int) -> int:
+    if not low <= value <= high:
+        raise CalibrationError(f"{key} is {value}, expected {low} to {high}")
+    return value
+
+
 def _core(module: Any, law: str, vehicle: Vehicle) -> np.ndarray:
+    if not vehicle.mass_kg > 0:
+        raise CalibrationError(f"mass_kg is {vehicle.mass_kg:g}, expected more than 0")
     core = np.zeros(1, firmware.CORE_PARAMS)
     core["mass"] = fixed("mass_kg", vehicle.mass_kg, Q_FORCE)
     core["law"] = law_number(law)
@@ -117,47 +134,50 @@ def _reference(period_s: float, profile: np.ndarray, preview_ticks: int) -> np.n
     params = np.zeros(1, reference.REFERENCE_PARAMS)
     speed, acceleration = 3 / period_s, 6 / period_s**2
     if abs(speed - round(speed)) > 1e-6 or abs(acceleration - round(acceleration)) > 1e-3:
-        raise CalibrationError(f"control period {period_s:g} s must divide 1 s")
-    if not 0 <= preview_ticks <= reference.PREVIEW_MAX:
-        raise CalibrationError(
-            f"preview of {preview_ticks} ticks, expected 0 to {reference.PREVIEW_MAX}"
-        )
+        raise CalibrationError(f"period_s is {period_s:g}, expected one that divides 1 s")
     params["speed_factor"] = round(speed)
     params["acceleration_factor"] = round(acceleration)
     params["segment_count"] = len(profile)
-    params["preview"] = preview_ticks
+    params["preview"] = _whole("control.preview_ticks", preview_ticks, 0, reference.PREVIEW_MAX)
     return params
 
 
-def _memory(
-    module: Any, gains: Any, vehicle: Vehicle, settings: MemorySettings, ticks: int
-) -> np.ndarray:
+def _words(module: Any, gains: Any, vehicle: Vehicle) -> np.ndarray:
+    """MEMORY_PARAMS with what the law says of its words."""
     params = np.zeros(1, memory.MEMORY_PARAMS)
-    params["scale"] = 1
     if not module.WORDS:
         return params
-    if settings.decimation < 1:
-        raise CalibrationError(f"memory.decimation is {settings.decimation}, expected 1 or more")
-    if settings.interpolation not in ("hold", "linear"):
-        raise CalibrationError(
-            f"memory.interpolation is {settings.interpolation!r}, expected hold or linear"
-        )
-    if settings.storage not in ("int32", "int16"):
-        raise CalibrationError(f"memory.storage is {settings.storage!r}, expected int32 or int16")
     initial, low, high = module.learned(gains, vehicle)
     words = len(initial)
     # A law whose gains learn only its first words stores only these; the others keep their value.
-    stored = getattr(module, "words_stored", lambda _: words)(gains)
-    params["words"] = stored
-    params["cells"] = -(-ticks // settings.decimation)
-    params["decimation"] = settings.decimation
-    params["lead"] = settings.lead_ticks
-    params["linear"] = int(settings.interpolation == "linear")
-    params["weight"] = round(2**30 / (2 * settings.decimation))
-    params["scale"] = 1 if settings.storage == "int32" else 2**16
+    params["words"] = getattr(module, "words_stored", lambda _: words)(gains)
     params["initial"][0, :words] = initial
     params["low"][0, :words] = low
     params["high"][0, :words] = high
+    return params
+
+
+def _memory(params: np.ndarray, settings: MemorySettings, ticks: int) -> np.ndarray:
+    """`params` of `_words` with the grid."""
+    params["scale"] = 1
+    if params["words"] == 0:
+        return params
+    decimation = _whole("control.memory.decimation", settings.decimation, 1, ticks)
+    lead = _whole("control.memory.lead_ticks", settings.lead_ticks, 0, ticks)
+    if settings.interpolation not in ("hold", "linear"):
+        raise CalibrationError(
+            f"control.memory.interpolation is {settings.interpolation!r}, expected hold or linear"
+        )
+    if settings.storage not in ("int32", "int16"):
+        raise CalibrationError(
+            f"control.memory.storage is {settings.storage!r}, expected int32 or int16"
+        )
+    params["cells"] = -(-ticks // decimation)
+    params["decimation"] = decimation
+    params["lead"] = lead
+    params["linear"] = int(settings.interpolation == "linear")
+    params["weight"] = round(2**30 / (2 * decimation))
+    params["scale"] = 1 if settings.storage == "int32" else 2**16
     return params
 
 

@@ -40,9 +40,11 @@ from controller.interface import (
     ARMED,
     BRAKE,
     COAST,
+    ENDED,
     ESTIMATES_MAX,
     FAULT_TICK,
     GUARD_NORMAL,
+    IDLE,
     INPUTS,
     OUTPUTS,
     RUNNING,
@@ -66,7 +68,8 @@ _POSITION_SHIFT = Q_POSITION - binary_exponent(TRAIN_POSITION, "Position")
 _FORCE_SHIFT = Q_FORCE - binary_exponent(FORCE_CMD, "Force")
 _POSITION_ERROR_SHIFT = Q_POSITION - binary_exponent(ATO_TRACKING, "PositionError")
 _SPEED_ERROR_SHIFT = Q_SPEED - binary_exponent(ATO_TRACKING, "SpeedError")
-_PERMITTED_FACTOR = round(ATP_LIMIT.PermittedSpeed.scale * 2**Q_SPEED)
+# A hundredth has no exact Q24: 14 more bits keep the limit within an LSB.
+_PERMITTED_FACTOR = round(ATP_LIMIT.PermittedSpeed.scale * 2 ** (Q_SPEED + 14))
 
 LINK = np.dtype(
     [
@@ -238,7 +241,8 @@ def read_inputs(state: Any, rx: Any) -> None:
             core.faults = int64(core.faults) | FAULT_TICK
     if receive(state.links[ATP_LIMIT.index], rx[ATP_LIMIT.index], ATP_LIMIT.data_id):
         word = int64(rx[ATP_LIMIT.index].payload)
-        core.permitted_speed = sat32(get(word, ATP_LIMIT.PermittedSpeed) * _PERMITTED_FACTOR)
+        permitted = get(word, ATP_LIMIT.PermittedSpeed) * _PERMITTED_FACTOR
+        core.permitted_speed = sat32(round_shift(permitted, 14))
         core.supervision = get(word, ATP_LIMIT.Supervision)
 
 
@@ -391,6 +395,8 @@ def build_tick(law_step: Any) -> Any:
         if receive(state.links[RUN_CTRL.index], rx[RUN_CTRL.index], RUN_CTRL.data_id):
             word = int64(rx[RUN_CTRL.index].payload)
             wanted = get(word, RUN_CTRL.RunState)
+            if wanted > ENDED:
+                wanted = int64(IDLE)
             if wanted == RUNNING:
                 # A run starts only from armed: a controller that restarts inside a run stays
                 # silent.

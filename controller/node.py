@@ -17,7 +17,7 @@ from can_dbc.step import INTERPRETED, step
 from controller import memory, store
 from controller.calibration import Calibration
 from controller.firmware import build_tick, state_dtype
-from controller.interface import ARMED, ENDED, FAULTS_THAT_BLOCK_LEARNING
+from controller.interface import ARMED, ENDED, FAULTS_THAT_BLOCK_LEARNING, RUNNING
 from controller.registry import law_step, load_law
 
 
@@ -113,7 +113,7 @@ def cycle(node: Controller, period: int) -> None:
     now = int(core["run_state"])
     if now == ARMED:
         memory.start_run(node.state[0]["memory"], node.cells)
-    elif now == ENDED and before != ENDED:
+    elif now == ENDED and before == RUNNING:
         finish_run(node)
 
 

@@ -47,8 +47,10 @@ def round_shift(value: Any, bits: Any) -> Any:
 
 @step
 def divide_round(numerator: Any, denominator: Any) -> Any:
-    """numerator / denominator rounded half up, denominator > 0; 0 if the denominator is 0.
-    |numerator| < 2**62."""
+    """numerator / denominator, rounded half up; 0 if the denominator is 0.
+
+    |numerator| <= 2**61, 0 <= denominator < 2**62.
+    """
     return (2 * numerator + denominator) // (2 * denominator)
 
 
@@ -62,7 +64,7 @@ _SIN_7 = round(-0.00437093 * 2**28)
 
 @step
 def sin_half_pi(s: Any) -> Any:
-    """sin(pi/2 * s), Q30, for s in Q30 in [0, 1]; relative error below 1.2e-6."""
+    """sin(pi/2 * s), Q30, for s in Q30 in [0, 1]; error below 1.2e-6 of it and half an LSB."""
     square = (s * s) >> 30
     series = _SIN_5 + ((_SIN_7 * square) >> 30)
     series = _SIN_3 + ((series * square) >> 30)

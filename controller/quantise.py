@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -22,8 +23,8 @@ class Vehicle:
 def fixed(key: str, value: float, q: int, bits: int = 32) -> int:
     """`value` in units of 2**-q as a signed integer of `bits`; raises CalibrationError if it does
     not fit."""
-    scaled = round(value * 2.0**q)
-    if not -(2 ** (bits - 1)) <= scaled < 2 ** (bits - 1):
+    scaled = value * 2.0**q
+    if not (math.isfinite(scaled) and -(2 ** (bits - 1)) <= round(scaled) < 2 ** (bits - 1)):
         limit = 2.0 ** (bits - 1 - q)
         raise CalibrationError(f"{key}: {value:g} is outside what the firmware holds, +-{limit:g}")
-    return scaled
+    return round(scaled)

@@ -3,10 +3,10 @@ eqs. (30)-(35)).
 
     e      = x - x_r,   ed = v - v_r                                tracking errors
     delta  = alpha e + ed                                           augmented error
-    chi    = delta / cos^2(pi/2 r),  r = min(delta^2 / nu_b^2, r_max)   barrier                 (30)
-    Xi_i   = clamp(Xi_{i-1} + Gamma xi chi, Xi_min, Xi_max)         along runs, xi = [-1, -v, -v^2]
-     (33)-(35) u      = Xi_1 + Xi_2 v + Xi_3 v^2 + M a_r - M alpha ed - beta delta
-            (31)
+    chi    = delta / cos^2(pi/2 r),  r = min(delta^2 / nu_b^2, r_max)   barrier             (30)
+    Xi_i   = clamp(Xi_{i-1} + Gamma xi chi, Xi_min, Xi_max)                            (33)-(35)
+             along runs, xi = [-1, -v, -v^2]
+    u      = Xi_1 + Xi_2 v + Xi_3 v^2 + M a_r - M alpha ed - beta delta                     (31)
 
 Everything is divided by the mass M: f = u/M, theta = Xi/M, Gamma/M, beta/M. Order in a tick:
 measure, delta, chi, Xi_i (with the current chi), u. a_r is previewed by the actuator's lag
@@ -28,7 +28,7 @@ theta is finer than the table of `controller/q.py`: one run changes it by 1e-6 o
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -71,8 +71,8 @@ class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     alpha: float  # 1/s
     beta: float  # N s/m
     Gamma: tuple[float, float, float]  # diagonal
-    nu_b: float  # m/s
-    r_max: float  # 0..1
+    nu_b: Annotated[float, msgspec.Meta(gt=0)]  # m/s
+    r_max: Annotated[float, msgspec.Meta(ge=0, le=1)]
     Xi_min: tuple[float, float, float]  # N, N s/m, N s^2/m^2
     Xi_max: tuple[float, float, float]
     Xi_initial: tuple[float, float, float]
