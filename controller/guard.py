@@ -90,8 +90,8 @@ def state_of(params: Any, faults: Any, speed: Any, permitted_speed: Any) -> Any:
 @step
 def limited(params: Any, state: Any, force: Any) -> Any:
     """The force that the guard lets pass, Q27: the law's, no traction, or the service brake."""
-    if state == GUARD_SERVICE_BRAKE:
-        return min(force, int64(params.service_brake))
+    if state == GUARD_NORMAL:
+        return force
     if state == GUARD_COAST:
         return min(force, int64(0))
-    return force
+    return min(force, int64(params.service_brake))

@@ -125,6 +125,9 @@ class Bench:
         if recorder is not None and recorder.process.poll() is None:
             recorder.command(command="stop")
         self._end("recorder", 30.0, terminate=False)
+        for node in self.nodes.values():
+            if node.log.exists() and node.log.stat().st_size == 0:
+                node.log.unlink()
 
     def _end(self, name: str, timeout_s: float, terminate: bool = True) -> None:
         node = self.nodes.get(name)

@@ -48,6 +48,12 @@ def test_every_call_executes_about_as_many_instructions(law):
     assert row.state == PASSED, row.result
 
 
+def test_every_part_of_the_tick_is_timed():
+    rows = list(cost.check_parts("cailc"))
+    assert [row.state for row in rows] == [PASSED] * len(rows)
+    assert rows[-1].subject == "whole tick, cailc"
+
+
 def test_the_command_passes_for_one_law():
     process = subprocess.run(
         [sys.executable, "-m", "tools.cli", "verify", "cailc", "--fast"],
