@@ -84,4 +84,4 @@ def _is_read_only(function: llvm.ValueRef, name: str) -> bool:
     for argument in function.arguments:
         if argument.name in (f"arg.{name}", f"arg.{name}.4"):  # a record; data pointer of an array
             return bool(re.search(r"\b(readonly|readnone)\b", str(b" ".join(argument.attributes))))
-    return True  # the step does not use it
+    return False  # there is no such argument
