@@ -18,7 +18,7 @@ DEV_READY := .venv/dev.ready
 COMPILE := .venv/bin/python -m uv pip compile pyproject.toml --universal --generate-hashes --group build \
 	--no-header --no-annotate --no-emit-index-url --quiet
 
-.PHONY: help hil test long lint types lock clean
+.PHONY: help hil test long verify golden lint types lock clean
 
 help: ## list the targets
 	sed -nE 's/^([a-z]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 14
@@ -34,6 +34,12 @@ test: $(DEV_READY) ## set up and pass the fast tests
 
 long: $(DEV_READY) ## pass the long tests
 	.venv/bin/python -m pytest -q -m "long and not pil and not uml" $(PYTEST_ARGS)
+
+verify: $(RUN_READY) ## check every promise of the firmware: LAWS="cailc pid", all by default
+	.venv/bin/ato-hil verify $(LAWS)
+
+golden: $(RUN_READY) ## write new golden digests (tools/verify/golden.json) and say what changed
+	.venv/bin/ato-hil verify --renew-golden $(LAWS)
 
 lint: $(DEV_READY) ## ruff: lint and format
 	.venv/bin/python -m ruff check .

@@ -142,7 +142,8 @@ def close_cell(params: Any, state: Any, memory: Any) -> None:
                 before = int64(memory[read, here, w]) * scale
                 value = clamp(before + mean, int64(params.low[w]), int64(params.high[w]))
                 if scale != 1:
-                    value = min(divide_round(value, scale), INT32_MAX // scale)  # rounds up to 2^15
+                    highest = INT32_MAX // max(scale, int64(1))
+                    value = min(divide_round(value, scale), highest)  # rounds up to 2^15
                 memory[1 - read, here, w] = value
                 state.total[w] = 0
         state.write_phase = 0

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 if TYPE_CHECKING:
     from plant_sim.scenario import Loaded
+    from tools.verify import Row
 
 app = typer.Typer(
     name="ato-hil",
@@ -390,6 +392,47 @@ def bench(
             f"{figure.ratio:.2f}",
         )
     console.print(table)
+
+
+def _print_rows(rows: list[Row]) -> None:
+    shown = Table("property", "of", "how it was checked", "result", "", header_style="bold")
+    for row in rows:
+        colour = {"passed": "green", "absent": "yellow", "failed": "red"}[row.state]
+        cells = (escape(cell) for cell in (row.name, row.subject, row.how, row.result))
+        shown.add_row(*cells, f"[{colour}]{row.state}[/]")
+    console.print(shown)
+
+
+@app.command()
+def verify(
+    laws: Annotated[list[str] | None, typer.Argument(help="Laws; all by default.")] = None,
+    fast: Annotated[bool, typer.Option("--fast", help="Only what takes seconds.")] = False,
+    renew_golden: Annotated[
+        bool, typer.Option("--renew-golden", help="Write new golden digests and say what changed.")
+    ] = False,
+) -> None:
+    """Check every promise of the firmware: integers, no overflow, same bits, accuracy, time."""
+    from controller.registry import law_names
+    from tools.verify import identity, table
+
+    rows = []
+    with one_line_for_bad_input():
+        if renew_golden:
+            for line in identity.renew(laws or law_names()):
+                console.print(line, soft_wrap=True, markup=False)
+            return
+        with console.status("verifying") as status:
+            for row in table.run(laws or [], fast):
+                rows.append(row)
+                if not console.is_terminal:
+                    line = f"{row.state}: {row.name}, {row.subject}; {row.how}: {row.result}"
+                    console.print(line, soft_wrap=True, markup=False)
+                status.update(f"{len(rows)} checks; last: {row.name}, {row.subject}")
+    if console.is_terminal:
+        _print_rows(rows)
+    if rows[-1].state == "failed":
+        last = rows[-1]
+        raise _fail(f"{last.name} of {last.subject} failed: {last.result}", EXIT_BAD_INPUT)
 
 
 def main() -> None:

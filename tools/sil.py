@@ -105,6 +105,18 @@ def run(
 ) -> Iterator[tuple[RunResult, controller_node.Controller]]:
     """The runs numbered `runs`, one after the other; `progress(run, tick)` is called as they go."""
     node = controller_node.build(calibration, memory_file)
+    yield from run_controller(loaded, node, runs=runs, seed=seed, progress=progress)
+
+
+def run_controller(
+    loaded: Loaded,
+    node: controller_node.Controller,
+    *,
+    runs: range,
+    seed: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[tuple[RunResult, controller_node.Controller]]:
+    """The same with a controller that the caller has built."""
     here = world.build(loaded, seed)
     here.tx, here.rx = node.rx, node.tx  # the mailboxes are the bus
     _begin, sense, actuate_and_advance = here.steps

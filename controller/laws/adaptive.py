@@ -62,6 +62,7 @@ ESTIMATES = (("h/M", "m/s^2", 27), ("delta", "m/s", 24), ("rho", "", 30))
 
 H_MAX = (1 << 44) - 1
 Q_MAX = 1 << 32
+STATE_BOUNDS = {"h": (0, H_MAX)}
 
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 

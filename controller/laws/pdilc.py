@@ -37,6 +37,7 @@ PARAMS = np.dtype(
 )
 
 STATE = pid_law.STATE
+STATE_BOUNDS = pid_law.STATE_BOUNDS
 
 # Learned words: name, unit, Q.
 WORDS = (("u/M", "m/s^2", 27),)

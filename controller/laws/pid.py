@@ -45,6 +45,7 @@ WORDS = ()
 ESTIMATES = (("integral", "m", 16),)
 
 INTEGRAL_MAX = 1 << 40
+STATE_BOUNDS = {"integral": (-INTEGRAL_MAX, INTEGRAL_MAX)}
 
 
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
