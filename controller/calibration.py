@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from controller import distribution, firmware, guard, memory, reference
+from controller import distribution, firmware, gradient_map, guard, memory, reference
 from controller.q import Q_ACCELERATION, Q_FORCE, Q_SPEED
 from controller.quantise import CalibrationError, Vehicle, fixed
 from controller.registry import law_number, load_law
@@ -68,6 +68,7 @@ def calibrate(
     motor_cars: list[int],
     car_traction_max_n: Sequence[float] = (),
     car_brake_max_n: Sequence[float] = (),
+    map_sections: Sequence[tuple[float, float, float]] = (),
     scenario_digest: str,
 ) -> Calibration:
     """PARAMS of the firmware for one law on one scenario. Raises CalibrationError or LawError with
@@ -81,6 +82,7 @@ def calibrate(
         words = _words(module, typed, vehicle)
     except (msgspec.ValidationError, CalibrationError) as error:
         raise CalibrationError(f"laws.{law}: {error}") from None
+    params["gradient_map"] = gradient_map.calibrate(map_sections)
     params["guard"] = _guard(guard_settings)
     params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
     ticks = int(profile["ticks"].sum()) + 1

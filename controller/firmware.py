@@ -35,7 +35,7 @@ from can_dbc.codec import (
     saturate,
 )
 from can_dbc.step import int64, step
-from controller import distribution, guard, memory, reference
+from controller import distribution, gradient_map, guard, memory, reference
 from controller.interface import (
     ARMED,
     BRAKE,
@@ -103,7 +103,7 @@ CORE_STATE = np.dtype(
         ("permitted_speed", np.int32),  # Q24
         ("supervision", np.int32),
         ("quality", np.int32),
-        ("padding", np.int32),
+        ("map_section", np.int32),  # of the gradient map
         ("car_force", np.int32, (distribution.CARS_MAX,)),  # N Q4
         ("sent", np.int32, (MESSAGE_COUNT,)),  # next end-to-end counter of each message sent
     ],
@@ -118,6 +118,7 @@ def params_dtype(law_params: np.dtype) -> np.dtype:
             ("core", CORE_PARAMS),
             ("guard", guard.PARAMS),
             ("reference", reference.REFERENCE_PARAMS),
+            ("gradient_map", gradient_map.PARAMS),
             ("memory", memory.MEMORY_PARAMS),
             ("distribution", distribution.PARAMS),
             ("law", law_params),
@@ -184,6 +185,7 @@ def begin(params: Any, profile: Any, state: Any) -> None:
     core.permitted_speed = 0
     core.supervision = 0
     core.quality = 0
+    core.map_section = 0
     for i in range(MESSAGE_COUNT):
         core.sent[i] = 0
         state.links[i].counter = -1
@@ -259,6 +261,17 @@ def read_reference(params: Any, state: Any) -> None:
 
 
 @step
+def read_map(params: Any, state: Any) -> None:
+    """What the gradient map says where the train is."""
+    position = int64(state.inputs.position)
+    section = gradient_map.read(params.gradient_map, int64(state.core.map_section), position)
+    state.core.map_section = section
+    state.inputs.map_acceleration = gradient_map.acceleration(
+        params.gradient_map, section, position
+    )
+
+
+@step
 def car_words(core: Any, tx: Any, cars: Any) -> None:
     """CAR_FORCE_1 to CAR_FORCE_4, two cars a frame, as many as there are cars."""
     if cars > 0:
@@ -318,6 +331,7 @@ def build_tick(law_step: Any) -> Any:
         core = state.core
         inputs = state.inputs
         read_reference(params, state)
+        read_map(params, state)
         inputs.tick = core.tick
         inputs.iteration = core.iteration
 

@@ -21,7 +21,7 @@ INPUTS = np.dtype(
         ("ahead_speed", np.int32),  # m/s, Q24
         ("ahead_acceleration", np.int32),  # m/s^2, Q27
         ("limited", np.int32),  # 1: the command of the last tick was limited on its way out
-        ("padding", np.int32),
+        ("map_acceleration", np.int32),  # resistance of the track by the gradient map, m/s^2, Q27
     ],
     align=True,
 )

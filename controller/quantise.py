@@ -12,12 +12,22 @@ class CalibrationError(ValueError):
 
 
 @dataclass(frozen=True)
+class Characteristic:
+    """Largest force at a speed v: min(force_n - slope_n_s_m v, power_w / v), either way."""
+
+    force_n: float
+    slope_n_s_m: float
+    power_w: float | None  # None: no such limit
+
+
+@dataclass(frozen=True)
 class Vehicle:
     """What the controller knows of its train."""
 
     mass_kg: float
     period_s: float  # control period
     force_max_m_s2: float  # largest specific force of the actuators
+    characteristic: Characteristic | None = None
 
 
 def fixed(key: str, value: float, q: int, bits: int = 32) -> int:

@@ -22,17 +22,22 @@ from plant_sim.actuator import Actuator
 from plant_sim.planner import PlanError, ProfilePlan, plan_profile
 from plant_sim.profile import Profile, evaluate
 from plant_sim.track import Track
-from plant_sim.trains import couplers, lumped
+from plant_sim.trains import couplers, lumped, point
 
 FOLDER = Path(__file__).with_name("scenarios")
 # The train models; key `train.model` chooses. Each file has a Train, PARAMS, STATE, calibrate, and
 # the steps reset, command, advance.
-MODELS: dict[type, ModuleType] = {lumped.Train: lumped, couplers.Train: couplers}
-AnyTrain = lumped.Train | couplers.Train
+MODELS: dict[type, ModuleType] = {
+    lumped.Train: lumped,
+    couplers.Train: couplers,
+    point.Train: point,
+}
+AnyTrain = lumped.Train | couplers.Train | point.Train
 
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
 Ticks = Annotated[int, msgspec.Meta(ge=0, le=10_000)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=2)]
 MassError = Annotated[float, msgspec.Meta(ge=-0.5, le=1)]
 
 
@@ -80,6 +85,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     preview_ticks: Ticks = 0  # the reference acceleration is read this far ahead
     distribute: bool = False  # give each car a force of its own
     mass_error: MassError = 0.0  # the controller works with (1 + mass_error) times the true mass
+    map_share: Share = 0.0  # part of the resistance of the track that the onboard map has
     memory: dict[str, Any] = {}
     guard: dict[str, Any] = {}
 
@@ -214,5 +220,15 @@ def _check(path: Path, scenario: Scenario) -> None:
             raise ScenarioError(f"{path}: key control.distribute: {model}, expected true")
         if scenario.track.application != "smeared":
             raise ScenarioError(f"{path}: key track.application: {model}, expected 'smeared'")
+    if isinstance(scenario.train, point.Train):
+        model = "train model 'point' has no cars"
+        if scenario.control.distribute:
+            raise ScenarioError(f"{path}: key control.distribute: {model}, expected false")
+        if scenario.track.application == "smeared":
+            raise ScenarioError(f"{path}: key track.application: {model}, expected 'point'")
+    elif scenario.track.sloped:
+        key = "interpolation" if scenario.track.interpolation != "hold" else "averaged_over_m"
+        model = "only train model 'point' takes such a track"
+        raise ScenarioError(f"{path}: key track.{key}: {model}")
     if not scenario.profile.limits:
         raise ScenarioError(f"{path}: key profile.limits: expected at least one limit")

@@ -1,4 +1,4 @@
-"""The track: additional resistance (gradients, curves, tunnels) by position, piecewise constant."""
+"""The track: additional resistance (gradients, curves, tunnels) by position, piecewise linear."""
 
 from __future__ import annotations
 
@@ -11,38 +11,79 @@ from can_dbc.step import int64, step
 
 Place = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 Resistance = Annotated[float, msgspec.Meta(ge=-1e3, le=1e3)]
+Length = Annotated[float, msgspec.Meta(ge=0, le=1e4)]
 
 SECTION = np.dtype(
     [
         ("from_m", np.float64),  # the section starts here and ends where the next one starts
-        ("resistance_n_per_kn", np.float64),  # positive holds the train back
+        ("resistance_n_per_kn", np.float64),  # at its start; positive holds the train back
+        ("slope_n_per_kn_m", np.float64),  # change a metre
     ]
 )
 
 
 class Track(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Additional resistance from each position on; before the first position it is 0."""
+    """Additional resistance from each position on; before the first position it is 0.
+
+    A train that is one mass meets steps as if it had no length; `averaged_over_m` gives it one.
+    """
 
     application: str = "point"  # point: at the front for the whole train; smeared: car by car
+    interpolation: str = "hold"  # hold: constant from each position on; linear: straight in between
+    averaged_over_m: Length = 0.0  # mean of the steps over so many metres behind the front
     from_m: list[Place] = []
     resistance_n_per_kn: list[Resistance] = []
 
     def __post_init__(self) -> None:
         if self.application not in ("point", "smeared"):
             raise ValueError(f"application is {self.application!r}, expected point or smeared")
+        if self.interpolation not in ("hold", "linear"):
+            raise ValueError(f"interpolation is {self.interpolation!r}, expected hold or linear")
+        if self.averaged_over_m > 0 and (self.interpolation, self.application) != ("hold", "point"):
+            raise ValueError("averaged_over_m needs interpolation hold and application point")
         if len(self.from_m) != len(self.resistance_n_per_kn):
             raise ValueError("from_m and resistance_n_per_kn must have the same length")
         if any(b <= a for a, b in zip(self.from_m, self.from_m[1:], strict=False)):
             raise ValueError("from_m must rise")
 
+    @property
+    def sloped(self) -> bool:
+        """Whether the resistance changes inside a section."""
+        return self.interpolation == "linear" or self.averaged_over_m > 0
+
 
 def sections(track: Track) -> np.ndarray:
     """The track as SECTION records, with a level one from -inf in front."""
-    table = np.zeros(len(track.from_m) + 1, SECTION)
+    from_m = np.asarray(track.from_m, np.float64)
+    resistance = np.asarray(track.resistance_n_per_kn, np.float64)
+    if track.averaged_over_m > 0:
+        from_m, resistance = _averaged(from_m, resistance, track.averaged_over_m)
+    table = np.zeros(len(from_m) + 1, SECTION)
     table["from_m"][0] = -np.inf
-    table["from_m"][1:] = track.from_m
-    table["resistance_n_per_kn"][1:] = track.resistance_n_per_kn
+    table["from_m"][1:] = from_m
+    table["resistance_n_per_kn"][1:] = resistance
+    if track.sloped:
+        table["slope_n_per_kn_m"][1:-1] = np.diff(resistance) / np.diff(from_m)
     return table
+
+
+def _averaged(
+    from_m: np.ndarray, steps: np.ndarray, length_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Knots of the mean of `steps` over the last `length_m`: it is linear between them."""
+    if len(from_m) == 0:
+        return from_m, steps
+    # Rounded, so that ends that meet on paper do so here.
+    knots = np.unique(np.round(np.concatenate([from_m, from_m + length_m]), 6))
+    # Integral of the steps at the knots and a train's length behind them.
+    integral = np.concatenate([[0.0], np.cumsum(steps[:-1] * np.diff(from_m))])
+
+    def integral_at(position_m: np.ndarray) -> np.ndarray:
+        index = np.maximum(np.searchsorted(from_m, position_m, side="right") - 1, 0)
+        into_m = np.maximum(position_m - from_m[index], 0.0)
+        return np.asarray(integral[index] + steps[index] * into_m)
+
+    return knots, (integral_at(knots) - integral_at(knots - length_m)) / length_m
 
 
 @step
@@ -54,3 +95,13 @@ def section_at(table: Any, position_m: Any, hint: Any) -> Any:
     while index > 0 and position_m < table[index].from_m:
         index -= 1
     return index
+
+
+@step
+def resistance_at(table: Any, index: Any, position_m: Any) -> Any:
+    """Additional resistance in section `index` at `position_m`, N/kN."""
+    section = table[index]
+    resistance = section.resistance_n_per_kn
+    if section.slope_n_per_kn_m != 0.0:  # the first section begins at -inf
+        resistance += section.slope_n_per_kn_m * (position_m - section.from_m)
+    return resistance

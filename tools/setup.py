@@ -7,9 +7,12 @@ from typing import Any
 import msgspec
 
 from controller.calibration import Calibration, GuardSettings, MemorySettings, calibrate
-from controller.quantise import CalibrationError, Vehicle
+from controller.quantise import CalibrationError, Characteristic, Vehicle
 from controller.registry import load_law
-from plant_sim.scenario import Loaded, ScenarioError
+from plant_sim import track
+from plant_sim.scenario import Loaded, Scenario, ScenarioError
+from plant_sim.trains import point
+from plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 
 def calibration_for(loaded: Loaded, law: str) -> Calibration:
@@ -27,6 +30,7 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
                 scenario.train.mass_kg * (1.0 + scenario.control.mass_error),
                 scenario.period_s,
                 scenario.actuator.force_max_m_s2,
+                _characteristic(scenario),
             ),
             profile=loaded.segments,
             preview_ticks=scenario.control.preview_ticks,
@@ -36,10 +40,35 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
             motor_cars=list(scenario.train.motor_cars),
             car_traction_max_n=scenario.train.traction_max_n,
             car_brake_max_n=scenario.train.brake_max_n,
+            map_sections=_map_sections(scenario),
             scenario_digest=loaded.digest,
         )
     except CalibrationError as error:
         raise ScenarioError(f"{loaded.path}: {error}") from None
+
+
+def _characteristic(scenario: Scenario) -> Characteristic | None:
+    """What the controller knows of the train's traction: all of it."""
+    train = scenario.train
+    if not isinstance(train, point.Train) or train.characteristic is None:
+        return None
+    known = train.characteristic
+    return Characteristic(known.force_n, known.slope_n_s_m, known.power_w)
+
+
+def _map_sections(scenario: Scenario) -> list[tuple[float, float, float]]:
+    """The onboard gradient map: the track's own sections, as far as `control.map_share` says."""
+    factor = scenario.control.map_share * GRAVITY_M_S2 * N_PER_KN
+    if factor == 0:
+        return []
+    return [
+        (
+            float(section["from_m"]),
+            factor * float(section["resistance_n_per_kn"]),
+            factor * float(section["slope_n_per_kn_m"]),
+        )
+        for section in track.sections(scenario.track)[1:]
+    ]
 
 
 def _settings(key: str, values: dict[str, Any], kind: Any) -> Any:

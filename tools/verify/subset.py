@@ -29,6 +29,8 @@ SHARED_MODULES = (
     "controller.memory",
     "controller.reference",
     "controller.guard",
+    "controller.gradient_map",
+    "controller.characteristic",
     "controller.distribution",
     "controller.firmware",
 )

@@ -1,0 +1,72 @@
+"""The onboard gradient map: what gradients, curves and tunnels cost the train at a position.
+
+A table of sections, linear in each. Laws that use it add `map_acceleration` to the acceleration of
+the reference.
+
+Contract: `read` is a step of bounded time. It moves by at most one section a tick, so a section has
+to be longer than the way of a tick; a train that does not start in the first section is found
+within SECTIONS_MAX ticks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from can_dbc.step import int64, step
+from controller.q import INT32_MAX, clamp, round_shift, sat32
+from controller.quantise import CalibrationError, fixed
+
+SECTIONS_MAX = 128
+
+PARAMS = np.dtype(
+    [
+        ("sections", np.int32),  # 0: no map
+        ("padding", np.int32),
+        ("start", np.int32, (SECTIONS_MAX,)),  # m, Q15
+        ("acceleration", np.int32, (SECTIONS_MAX,)),  # m/s^2, Q27
+        ("slope", np.int32, (SECTIONS_MAX,)),  # 1/s^2, Q36
+    ],
+    align=True,
+)
+
+
+def calibrate(sections: Sequence[tuple[float, float, float]]) -> np.ndarray:
+    """PARAMS, shape (1,). A section is where it begins (m), what it has there (m/s^2, positive
+    holds the train back) and its change a metre (1/s^2); before the first one the map is 0. Raises
+    CalibrationError if they do not fit."""
+    params = np.zeros(1, PARAMS)
+    count = len(sections)
+    if count > SECTIONS_MAX:
+        raise CalibrationError(
+            f"control.map_share: {count} sections, expected up to {SECTIONS_MAX}"
+        )
+    params["sections"] = count
+    for k, (from_m, acceleration_m_s2, slope_1_s2) in enumerate(sections):
+        key = f"control.map_share: section {k + 1}"
+        params["start"][0, k] = fixed(f"{key}: from_m", from_m, 15)
+        params["acceleration"][0, k] = fixed(f"{key}: acceleration", acceleration_m_s2, 27)
+        params["slope"][0, k] = fixed(f"{key}: slope", slope_1_s2, 36)
+    return params
+
+
+@step
+def read(params: Any, section: Any, position: Any) -> Any:
+    """Number of the section at `position` (m, Q15), 0 before the first, from that of a tick ago."""
+    if section < int64(params.sections) and position >= int64(params.start[section]):
+        return section + 1
+    if section > 0 and position < int64(params.start[section - 1]):
+        return section - 1
+    return section
+
+
+@step
+def acceleration(params: Any, section: Any, position: Any) -> Any:
+    """What the map says at `position` in section number `section`, m/s^2, Q27."""
+    if section == 0:
+        return int64(0)
+    into = clamp(position - int64(params.start[section - 1]), int64(0), int64(INT32_MAX))
+    change = round_shift(into * int64(params.slope[section - 1]), 24)
+    return sat32(int64(params.acceleration[section - 1]) + change)

@@ -1,0 +1,119 @@
+"""PID on the position error with acceleration feed-forward: a baseline that paper 2 does not have.
+
+    e = x - x*,   ed = v - v*
+    u = m (-kp e - kd ed - ki sum(e Ts) + ff (a* + w(x)))
+
+a* may be previewed, w is what the onboard gradient map says. e is clamped to z1_max_m; meanwhile
+the integral is held, as it is where it would push a limited command further. Everything is divided
+by the mass M: f = u/M.
+
+| symbol   | unit        | format             | symbol | unit       | format            |
+| e, ed    | m, m/s      | Q24                | kp, kd | 1/s^2, 1/s | Q24               |
+| sum of e | m, in ticks | Q24, int64, +-2^36 | ki Ts  | 1/s^2      | Q28, below 0.125  |
+| u/m      | m/s^2       | Q28                | m/M    | -          | Q29               |
+| ff       | -           | Q30                | f      | m/s^2      | Q27               |
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from can_dbc.step import int64, step
+from controller.laws.drac import (
+    TRACK_PARAMS,
+    TRACK_STATE,
+    NotNegative,
+    Positive,
+    TrackGains,
+    at_stop,
+    begin_track,
+    brake_at_stop,
+    calibrate_track,
+    errors,
+    feed_forward,
+    limit,
+)
+from controller.q import clamp, round_shift, sat32
+from controller.quantise import Vehicle, fixed
+
+INTEGRAL_MAX = 1 << 36
+
+PARAMS = np.dtype(
+    [
+        ("track", TRACK_PARAMS),
+        ("kp", np.int32),  # 1/s^2, Q24
+        ("ki", np.int32),  # ki Ts, 1/s^2, Q28, below 2^25
+        ("kd", np.int32),  # 1/s, Q24
+        ("feed_forward", np.int32),  # Q30
+        ("mu", np.int32),  # m / M, Q29
+        ("padding", np.int32),
+    ],
+    align=True,
+)
+
+STATE = np.dtype(
+    [
+        ("track", TRACK_STATE),
+        ("integral", np.int64),  # sum of e, m in ticks, Q24
+    ],
+    align=True,
+)
+
+STATE_BOUNDS = {"integral": (-INTEGRAL_MAX, INTEGRAL_MAX)}
+
+WORDS = ()
+# Estimates in the traces: name, unit, Q.
+ESTIMATES = (("integral", "m ticks", 16),)
+
+
+class Gains(TrackGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Gains for each kilogram, and the mass that the law takes the train to have."""
+
+    kp: NotNegative  # 1/s^2
+    ki: NotNegative  # 1/s^3
+    kd: NotNegative  # 1/s
+    feed_forward: NotNegative = 1.0
+    mass_t: Positive
+
+
+def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
+    """PARAMS, shape (1,). Raises CalibrationError where a gain does not fit its format."""
+    params = np.zeros(1, PARAMS)
+    params["track"] = calibrate_track(gains, vehicle)
+    params["kp"] = fixed("kp", gains.kp, 24)
+    params["ki"] = fixed("ki Ts", gains.ki * vehicle.period_s, 28, 26)
+    params["kd"] = fixed("kd", gains.kd, 24)
+    params["feed_forward"] = fixed("feed_forward", gains.feed_forward, 30)
+    params["mu"] = fixed("mass_t / M", gains.mass_t * 1000 / vehicle.mass_kg, 29)
+    return params
+
+
+@step
+def pid_feedforward(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+    """One tick of the PID baseline."""
+    track = state.track
+    if int64(inputs.tick) == 0:
+        begin_track(track)
+        state.integral = 0
+    if at_stop(inputs):
+        outputs.force = brake_at_stop(params.track)
+    else:
+        errors(params.track, track, inputs)
+        z1 = int64(track.z1)
+        # The guard (inputs.limited) cuts traction only.
+        more_traction = z1 < 0 and (int64(track.limited) > 0 or int64(inputs.limited) != 0)
+        more_brake = z1 > 0 and int64(track.limited) < 0
+        held = more_traction or more_brake or int64(track.clamped) != 0
+        if not held:
+            most = int64(INTEGRAL_MAX)
+            state.integral = clamp(int64(state.integral) + z1, -most, most)
+        a = round_shift(feed_forward(inputs) * int64(params.feed_forward), 30)
+        a -= round_shift(z1 * int64(params.kp), 20)
+        a -= round_shift(int64(track.e2) * int64(params.kd), 20)
+        a -= round_shift(int64(state.integral) * int64(params.ki), 24)
+        wanted = sat32(round_shift(sat32(a) * int64(params.mu), 30))
+        outputs.force = limit(params.track, track, inputs, wanted)
+    outputs.status = 0
+    outputs.estimate[0] = sat32(int64(state.integral) >> 8)

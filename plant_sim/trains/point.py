@@ -1,0 +1,205 @@
+"""A train as one mass (papers 2 to 5): resistance that swings, traction characteristic.
+
+    v' = u/M - (c_0 + c_1 v + c_2 v^2) - w(x) + d,   c_q = value_q + swing_q sin(rate t)
+
+w is the track's additional resistance at the front, d the disturbance, |u| <= F_max(v): the command
+of a control period is limited by the speed at its start, braking like traction. v >= 0: at
+standstill the train stays until the force exceeds c_0 + w, and it never rolls back.
+
+Integration: midpoint rule, `substeps` a control period; the coefficients are those of the middle of
+the period. The sine comes from an exact rotation, no libm.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from can_dbc.step import int64, step
+from plant_sim.actuator import actuate
+from plant_sim.actuator import command as command_actuator
+from plant_sim.track import resistance_at, section_at
+from plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN, OSCILLATOR, small_rotation
+
+
+class Resistance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Davis resistance for each kilogram, each coefficient value + swing * sin(rad_per_s t)."""
+
+    constant: tuple[float, float]  # m/s^2
+    linear: tuple[float, float]  # 1/s
+    square: tuple[float, float]  # 1/m
+    rad_per_s: float = 0.0
+
+
+class Characteristic(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Largest force at a speed v: min(force_n - slope_n_s_m v, power_w / v)."""
+
+    force_n: float
+    slope_n_s_m: float = 0.0
+    power_w: float | None = None  # none: no such limit
+
+    def __post_init__(self) -> None:
+        if self.force_n <= 0 or self.slope_n_s_m < 0:
+            raise ValueError("expected force_n above 0 and slope_n_s_m 0 or more")
+        if self.power_w is not None and self.power_w <= 0:
+            raise ValueError(f"power_w is {self.power_w:g}, expected more than 0")
+
+
+class Train(
+    msgspec.Struct,
+    frozen=True,
+    forbid_unknown_fields=True,
+    kw_only=True,
+    tag_field="model",
+    tag="point",
+):
+    """Data of the train."""
+
+    mass_kg: float
+    resistance: Resistance
+    characteristic: Characteristic | None = None  # none: the plant gives what it is asked for
+    start_m: float = 0.0  # where it stands when a run begins
+    substeps: int = 5
+
+    # What a train of several cars has: this one has no cars, its sensors are in one place.
+    effectiveness = ()
+    motor_cars = ()
+    traction_max_n = ()
+    brake_max_n = ()
+    rear_offset_m = 0.0
+
+    def __post_init__(self) -> None:
+        if self.mass_kg <= 0:
+            raise ValueError(f"mass_kg is {self.mass_kg:g}, expected more than 0")
+        if self.substeps < 1:
+            raise ValueError(f"substeps is {self.substeps}, expected 1 or more")
+
+
+PARAMS = np.dtype(
+    [
+        ("substeps", np.int64),
+        ("step_s", np.float64),  # of the integration
+        ("period_s", np.float64),  # control period
+        ("mass_kg", np.float64),
+        ("kg_inverse", np.float64),  # 1 / mass
+        ("start_m", np.float64),
+        ("force_n", np.float64),  # of the characteristic
+        ("slope_n_s_m", np.float64),
+        ("power_w", np.float64),
+        ("coefficients", np.float64, (3,)),  # m/s^2, 1/s, 1/m
+        ("swings", np.float64, (3,)),
+        ("rotation", OSCILLATOR),  # of a control period
+        ("half_rotation", OSCILLATOR),
+    ],
+    align=True,
+)
+
+STATE = np.dtype(
+    [
+        ("position_m", np.float64),
+        ("speed_m_s", np.float64),
+        ("acceleration_m_s2", np.float64),  # mean over the last period
+        ("rear_position_m", np.float64),  # the same as position_m
+        ("rear_speed_m_s", np.float64),
+        ("force_n", np.float64),  # what the actuators gave at the end of the last period
+        ("traction_j", np.float64),  # work of the positive force since the start of the run
+        ("phase", OSCILLATOR),  # in the middle of the next period
+        ("section", np.int64),
+    ],
+    align=True,
+)
+
+
+def calibrate(train: Train, period_s: float, smeared: bool) -> np.ndarray:
+    """PARAMS, shape (1,). A scenario has no point train on a smeared track."""
+    assert not smeared
+    params = np.zeros(1, PARAMS)
+    params["substeps"] = train.substeps
+    params["step_s"] = period_s / train.substeps
+    params["period_s"] = period_s
+    params["mass_kg"] = train.mass_kg
+    params["kg_inverse"] = 1.0 / train.mass_kg
+    params["start_m"] = train.start_m
+    known = train.characteristic
+    params["force_n"] = np.inf if known is None else known.force_n
+    params["slope_n_s_m"] = 0.0 if known is None else known.slope_n_s_m
+    params["power_w"] = np.inf if known is None or known.power_w is None else known.power_w
+    source = train.resistance
+    for q, (value, swing) in enumerate((source.constant, source.linear, source.square)):
+        params["coefficients"][0, q] = value
+        params["swings"][0, q] = swing
+    angle = source.rad_per_s * period_s
+    for name, part in (("rotation", angle), ("half_rotation", angle / 2)):
+        params[name]["sine"], params[name]["cosine"] = small_rotation(part)
+    return params
+
+
+@step
+def reset(params: Any, state: Any) -> None:
+    """The train at rest at the start."""
+    state.position_m = params.start_m
+    state.speed_m_s = 0.0
+    state.acceleration_m_s2 = 0.0
+    state.rear_position_m = params.start_m
+    state.rear_speed_m_s = 0.0
+    state.force_n = 0.0
+    state.traction_j = 0.0
+    state.phase.sine = params.half_rotation.sine
+    state.phase.cosine = params.half_rotation.cosine
+    state.section = 0
+
+
+@step
+def command(params: Any, state: Any) -> None:
+    """The total force, as far as the characteristic allows it, into the actuators' channel 0."""
+    train = params.train
+    speed = state.train.speed_m_s
+    most = train.force_n - train.slope_n_s_m * speed
+    if most * speed > train.power_w:
+        most = train.power_w / speed
+    most = max(most, 0.0)
+    force = min(max(state.node.command_n[0], -most), most)
+    command_actuator(params.actuator, state.actuator, int64(0), force)
+
+
+@step
+def advance(
+    params: Any, track: Any, state: Any, actuator_params: Any, actuator: Any, disturbance_m_s2: Any
+) -> None:
+    """The train one control period later; the actuators' channel 0 carries the force."""
+    sine = state.phase.sine
+    cosine = state.phase.cosine
+    constant = params.coefficients[0] + params.swings[0] * sine - disturbance_m_s2
+    linear = params.coefficients[1] + params.swings[1] * sine
+    square = params.coefficients[2] + params.swings[2] * sine
+    gravity = GRAVITY_M_S2 * N_PER_KN
+    x = state.position_m
+    v = state.speed_m_s
+    v_before = v
+    h = params.step_s
+    half = 0.5 * h
+    work = 0.0
+    section = int64(state.section)
+    for _ in range(params.substeps):
+        force = actuate(actuator_params, actuator, int64(0))
+        here = x + half * v
+        section = section_at(track, here, section)
+        outside = (
+            force * params.kg_inverse - constant - gravity * resistance_at(track, section, here)
+        )
+        v_middle = max(v + half * (outside - v * (linear + square * v)), 0.0)
+        v = max(v + h * (outside - v_middle * (linear + square * v_middle)), 0.0)
+        x += h * v_middle
+        work += max(force, 0.0) * v_middle
+    state.position_m = x
+    state.speed_m_s = v
+    state.acceleration_m_s2 = (v - v_before) / params.period_s
+    state.rear_position_m = x
+    state.rear_speed_m_s = v
+    state.force_n = actuator.actual[0]
+    state.traction_j += h * work
+    state.section = section
+    state.phase.sine = sine * params.rotation.cosine + cosine * params.rotation.sine
+    state.phase.cosine = cosine * params.rotation.cosine - sine * params.rotation.sine

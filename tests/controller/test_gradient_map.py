@@ -1,0 +1,86 @@
+"""The onboard gradient map against a plain search and interpolation."""
+
+import numpy as np
+import pytest
+
+from can_dbc.step import step
+from controller import gradient_map
+from controller.quantise import CalibrationError
+
+HILLS = (
+    (100.0, 0.02, 0.0),
+    (300.0, 0.02, -2e-4),
+    (500.0, -0.02, 0.0),
+    (800.0, -0.02, 1e-3),
+    (820.0, 0.0, 0.0),
+)
+
+
+@step
+def read_along(params, positions, numbers, values):
+    section = np.int64(0)
+    for k in range(len(positions)):
+        section = gradient_map.read(params[0], section, positions[k])
+        numbers[k] = section
+        values[k] = gradient_map.acceleration(params[0], section, positions[k])
+
+
+def along(sections, position_m):
+    positions = np.round(np.asarray(position_m) * 2**15).astype(np.int64)
+    numbers, values = np.zeros((2, len(positions)), np.int64)
+    read_along(gradient_map.calibrate(sections), positions, numbers, values)
+    return numbers, values / 2**27
+
+
+def expected(sections, position_m):
+    start, first, slope = np.array(sections).T
+    index = np.searchsorted(start, position_m, side="right") - 1
+    row = np.maximum(index, 0)
+    value = first[row] + slope[row] * (position_m - start[row])
+    return np.where(index < 0, 0.0, value)
+
+
+@pytest.mark.parametrize("step_m", [0.83, -0.83, 5.0])
+def test_it_follows_the_train(step_m):
+    position_m = np.arange(0, 1000, abs(step_m))
+    if step_m < 0:
+        position_m = np.concatenate([position_m, position_m[::-1]])
+    position_m = np.round(position_m * 2**15) / 2**15
+    _, values = along(HILLS, position_m)
+    assert values == pytest.approx(expected(HILLS, position_m), abs=2e-8)
+
+
+def test_a_train_inside_the_map_is_found():
+    numbers, values = along(HILLS, np.full(10, 600.0))
+    assert list(numbers) == [1, 2, 3, 3, 3, 3, 3, 3, 3, 3]
+    assert values[-1] == pytest.approx(-0.02, abs=1e-8)
+
+
+def test_without_a_map_it_is_level():
+    numbers, values = along((), [-100.0, 0.0, 60000.0])
+    assert not numbers.any()
+    assert not values.any()
+
+
+def test_a_wild_position_does_not_overflow(interpreted):
+    params = gradient_map.calibrate(HILLS)
+    params["slope"] = 2**31 - 1
+    for section in range(6):
+        for position in (-(2**31), 2**31 - 1, 0):
+            value = interpreted("controller.gradient_map:acceleration", params, section, position)
+            assert -(2**31) <= value < 2**31
+            assert 0 <= interpreted("controller.gradient_map:read", params, section, position) <= 5
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ([(0.0, 0.0, 0.0)] * 129, "control.map_share: 129 sections, expected up to 128"),
+        ([(7e4, 0.0, 0.0)], "control.map_share: section 1: from_m: 70000 is outside"),
+        ([(0.0, 0.0, 0.0), (9.0, 0.0, 0.04)], "control.map_share: section 2: slope: 0.04 is"),
+    ],
+)
+def test_a_map_that_does_not_fit_is_refused(sections, message):
+    with pytest.raises(CalibrationError) as error:
+        gradient_map.calibrate(sections)
+    assert str(error.value).startswith(message)
