@@ -112,6 +112,12 @@ def test_every_step_of_the_house_keeps_the_subset():
     assert subset.check(modules) == []
 
 
+@pytest.mark.parametrize("law", registry.law_names())
+def test_a_law_alone_keeps_the_subset(law):
+    """Also one that builds on another, which is then linted with it."""
+    assert subset.check(subset.linted_modules([law])) == []
+
+
 def test_the_gates_on_the_ticks_see_every_step():
     assert table.check_reach().state == PASSED
     assert "controller.q.sin_half_pi" in subset.unreached(["pid"])

@@ -92,9 +92,15 @@ class Step:
 
 
 def linted_modules(laws: list[str]) -> list[ModuleType]:
-    """The shared modules and the modules of these laws."""
-    shared = [importlib.import_module(name) for name in SHARED_MODULES]
-    return shared + [registry.load_law(name) for name in laws]
+    """The shared modules, the modules of these laws, and those of the laws that they build on."""
+    found = [importlib.import_module(name) for name in SHARED_MODULES]
+    found += [registry.load_law(name) for name in laws]
+    for module in found:  # grows as it goes
+        for value in vars(module).values():
+            owner = str(getattr(value, "__module__", ""))
+            if owner.startswith("controller.laws.") and owner not in {m.__name__ for m in found}:
+                found.append(importlib.import_module(owner))
+    return found
 
 
 def check(modules: list[ModuleType]) -> list[Finding]:
