@@ -334,7 +334,7 @@ def compare(
 
 @app.command()
 def claims(
-    paper: Annotated[str, typer.Argument(help="Law that the paper is about: cailc.")],
+    paper: Annotated[str, typer.Argument(help="The paper, by its law: cailc, drac.")],
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the rows to this file as well.")
     ] = None,

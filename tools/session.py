@@ -24,6 +24,7 @@ from plant_sim.scenario import Loaded, load
 from tools import hil, metrics, setup, sil
 from tools.frames import Digest
 from tools.hil import RunError
+from tools.lyapunov import has_lyapunov, lyapunov
 from tools.recorder import save_settings
 
 SCHEMA = 1
@@ -186,6 +187,9 @@ def _run_in_process(session: Session, calibration: Any) -> None:
             if writer is not None:
                 writer.frames(result.run, result.frames)
                 writer.truth(result.run, result.truth)
+                if has_lyapunov(loaded, session.law):
+                    column = lyapunov(loaded, session.law, result.frames, result.truth)
+                    writer.truth(result.run, column)
                 writer.run_summary(result.run, row)
     finally:
         if writer is not None:
@@ -297,4 +301,8 @@ def _on_run(
     frames_file.unlink()
     tap = bench.nodes["recorder"]
     tap.command(command="truth", run=run, file=plant["file"])
+    if has_lyapunov(session.loaded, session.law):
+        lyapunov_file = kept / f"lyapunov_{run}.npy"
+        np.save(lyapunov_file, lyapunov(session.loaded, session.law, frames, truth))
+        tap.command(command="truth", run=run, file=str(lyapunov_file))
     tap.command(command="summary", run=run, row=row)

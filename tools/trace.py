@@ -340,6 +340,8 @@ class TraceWriter:
             entity = self._entity(f"truth/{field}", run)
             self._log_scalars(entity, index, table[field][:, None], ["true"], [GREEN])
         for error, field in ERRORS.items():
+            if field not in (table.dtype.names or ()):
+                continue  # a column of its own, such as the Lyapunov function
             reference = getattr(self._reference, field)
             count = min(len(table), len(reference))
             values = (table[field][:count] - reference[:count])[:, None]

@@ -16,6 +16,7 @@ from plant_sim.trains import lumped
 
 PERIOD = 0.01
 TRAIN = load("subway-paper").scenario.train
+assert isinstance(TRAIN, lumped.Train)
 MASSES = np.array(TRAIN.masses_kg)
 MASS = MASSES.sum()
 FREE = Actuator(force_max_m_s2=100.0)

@@ -81,7 +81,7 @@ def test_compare_lays_laws_side_by_side(tmp_path: Path) -> None:
     [
         (["compare", "subway", "--laws", "cailc,magic"], "no gains for law 'magic'"),
         (["compare", "nowhere", "--laws", "cailc"], "scenario 'nowhere' is unknown"),
-        (["claims", "nothing"], "no claims of 'nothing', expected one of cailc"),
+        (["claims", "nothing"], "no claims of 'nothing', expected one of cailc, drac"),
         (["claims", "cailc", "--json", "no/such/file.json"], "no/such/file.json: no such folder"),
     ],
 )
@@ -93,11 +93,12 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, arguments: list[str], says:
 
 
 @pytest.mark.long
-def test_the_claims_of_paper_1_come_out_as_found(tmp_path: Path) -> None:
-    done = ato_hil("claims", "cailc", "--json", "claims.json", cwd=tmp_path)
+@pytest.mark.parametrize(("paper", "least"), [("cailc", 20), ("drac", 15)])
+def test_the_claims_of_a_paper_come_out_as_found(tmp_path: Path, paper: str, least: int) -> None:
+    done = ato_hil("claims", paper, "--json", "claims.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "claims.json").read_text())["claims"]
-    assert len(rows) >= 20
+    assert len(rows) >= least
     assert all(row["holds"] == row["expected"] for row in rows)
     assert any(not row["holds"] for row in rows)
     assert all(math.isfinite(row["measured"]) for row in rows)

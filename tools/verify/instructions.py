@@ -32,6 +32,9 @@ CALLGRIND = (
     "--dump-after=ato_step",  # one file a call
 )
 RATIO_MAX = 1.5  # between the longest and the shortest call
+# Laws whose longest call does something that most calls need not do, in a bounded number of steps:
+# drac-robust projects its estimates back into their ball, at most twice.
+RATIO_MAX_OF = {"drac-robust": 2.5}
 
 
 class ToolError(RuntimeError):
@@ -51,8 +54,9 @@ def check(law: str) -> Iterator[Row]:
         yield Row(name, law, how, str(error), FAILED)
         return
     ratio = max(counts) / min(counts)
-    text = f"{min(counts)} to {max(counts)}, ratio {ratio:.2f}, bound {RATIO_MAX}"
-    yield row(name, law, how, text, ratio <= RATIO_MAX)
+    bound = RATIO_MAX_OF.get(law, RATIO_MAX)
+    text = f"{min(counts)} to {max(counts)}, ratio {ratio:.2f}, bound {bound}"
+    yield row(name, law, how, text, ratio <= bound)
 
 
 def count(module: ModuleType, params: list[np.ndarray]) -> list[int]:
