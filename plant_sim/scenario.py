@@ -106,6 +106,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     disturbance: Disturbance = Disturbance()
     control: Control = Control()
     metrics: Metrics = Metrics()
+    tuning: dict[str, str] = {}  # how the gains of each law were found, for who compares them
     base: str = ""
 
 

@@ -329,6 +329,9 @@ def compare(
             row["law"], *(_cell(row, key, f, s) for _n, key, f, s in COMPARED), _faults(row)
         )
     console.print(table)
+    for name in names:
+        if name in loaded.scenario.tuning:
+            console.print(f"gains of {name}: {loaded.scenario.tuning[name]}", soft_wrap=True)
     console.print(f"trace   {folder / 'trace.rrd'}", soft_wrap=True)
 
 
