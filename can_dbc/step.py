@@ -6,8 +6,8 @@ undecorated source runs in plain Python when ATO_HIL_INTERPRETED=1 is set before
 MIL mode): `int64` is then `Checked`, an integer that raises on the first value outside 64 bits,
 and a store outside its field's range raises OverflowError.
 
-The compiler's cache is keyed by the sources of all four packages and the DBC, because numba itself
-sees an edit of the compiled file only, not of what that file imports.
+The compiler's cache is keyed by the sources that a package may import and the DBC, because numba
+itself sees an edit of the compiled file only, not of what that file imports.
 """
 
 from __future__ import annotations
@@ -16,14 +16,20 @@ import hashlib
 import inspect
 import operator
 import os
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numba
 
 INTERPRETED = os.environ.get("ATO_HIL_INTERPRETED") == "1"
-PACKAGES = ("can_dbc", "controller", "plant_sim", "tools")
+# Each package and what it may import: a step compiles these sources in.
+IMPORTS = {
+    "can_dbc": ("can_dbc",),
+    "controller": ("can_dbc", "controller"),
+    "plant_sim": ("can_dbc", "plant_sim"),
+    "tools": ("can_dbc", "controller", "plant_sim", "tools"),
+}
 
 _INT64_MIN = -(2**63)
 _INT64_MAX = 2**63 - 1
@@ -96,26 +102,27 @@ def _file_digest(path: str) -> str:
         return "unreadable"
 
 
-@lru_cache(maxsize=1)
-def source_digest() -> str:
-    """Digest of every source that compiled code can depend on: the four packages, the DBC, the
-    compiler."""
+@cache
+def source_digest(package: str = "tools") -> str:
+    """Digest of every source that a step of `package` can depend on, the DBC and the compiler; a
+    step from elsewhere may depend on all four packages, as one of `tools`."""
     root = Path(__file__).resolve().parent.parent
-    files = sorted(path for package in PACKAGES for path in (root / package).rglob("*.py"))
+    packages = IMPORTS.get(package, IMPORTS["tools"])
+    files = sorted(path for name in packages for path in (root / name).rglob("*.py"))
     parts = [f"{path.relative_to(root)}:{_file_digest(str(path))}" for path in files]
     parts.append(_file_digest(str(dbc_path())))
     parts.append(numba.__version__)
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=12).hexdigest()
 
 
-def cache_directory() -> Path:
-    """Where compiled steps are kept: NUMBA_CACHE_DIR, else a folder a source digest in the user's
-    cache."""
+def cache_directory(package: str = "tools") -> Path:
+    """Where compiled steps of a package are kept: NUMBA_CACHE_DIR, else a folder a source digest
+    in the user's cache."""
     configured = os.environ.get("NUMBA_CACHE_DIR")
     if configured:
         return Path(configured)
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "ato-hil" / source_digest()
+    return Path(base) / "ato-hil" / source_digest(package)
 
 
 def _stable_identity(function: Any) -> str:
@@ -132,7 +139,7 @@ def step(function: Any) -> Any:
     """Compile `function` as an allocation-free step; in interpreted mode return it as it is."""
     if INTERPRETED:
         return function
-    numba.config.CACHE_DIR = str(cache_directory())
+    numba.config.CACHE_DIR = str(cache_directory(function.__module__.partition(".")[0]))
     compiled = numba.njit(
         nogil=True, error_model="numpy", cache=True, boundscheck=False, _nrt=False
     )(function)

@@ -267,6 +267,12 @@ def test_the_cache_is_in_the_folder_of_the_user(
     assert step_module.cache_directory() == folder
 
 
+def test_a_package_is_keyed_by_what_it_may_import_only() -> None:
+    digests = {step_module.source_digest(package) for package in step_module.IMPORTS}
+    assert len(digests) == 4
+    assert step_module.source_digest("elsewhere") == step_module.source_digest("tools")
+
+
 def test_the_cache_depends_on_the_dbc(tmp_path: Path) -> None:
     code = "from can_dbc.step import source_digest; print(source_digest())"
     changed = tmp_path / "changed.dbc"
