@@ -226,12 +226,15 @@ def _run(
     memory: Path | None,
     trace: bool,
 ) -> None:
+    from controller.registry import law_label
     from plant_sim.scenario import load
     from tools import session
     from tools.hil import RunError
 
     loaded = load(scenario)
-    folder = out or Path("runs") / f"{loaded.name}-{law or loaded.scenario.law}-{mode.value}"
+    folder = (
+        out or Path("runs") / f"{loaded.name}-{law_label(law or loaded.scenario.law)}-{mode.value}"
+    )
     options = session.Options(scenario, law, runs, mode.value, bus, seed, folder, memory, trace)
     screen = Screen(mode)
     try:
