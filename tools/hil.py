@@ -25,6 +25,7 @@ from controller.calibration import Calibration
 
 READY_TIMEOUT_S = 300.0  # the first start compiles
 STOP_TIMEOUT_S = 0.7  # of a node that was asked to end
+RECORDER_TIMEOUT_S = 20.0  # from the end of the last run to the recorder's account of it
 
 
 class RunError(Exception):
@@ -199,7 +200,12 @@ def run(
         )
         bench.wait_ready()
         plant.command(command="start")
+        deadline = None
         while "done" not in plant.said or recorder.said.get("run", {}).get("run") != runs[-1]:
             got = bench.next_event(0.5)
             if got is not None:
                 yield (*got, bench)
+            if "done" in plant.said:
+                deadline = deadline or time.monotonic() + RECORDER_TIMEOUT_S
+                if time.monotonic() > deadline:  # it may have lost just the frame that says so
+                    raise RunError(f"the recorder has not seen the end of run {runs[-1]}")

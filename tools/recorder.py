@@ -9,7 +9,8 @@ It says on stdout, in JSON lines:
 
     {"event": "ready"}                                     it listens
     {"event": "run", "run": 1, "ticks": …, "frames": …,    a run has ended; lost frames by message,
-     "lost": {…}, "digest": "…", "complete": true}         digest of all runs so far
+     "lost": {…}, "dropped": 0, "foreign": 0,              as the bus counted them, frames of other
+     "digest": "…", "complete": true}                      kinds, digest of all runs so far
     {"event": "error", "message": "…"}                     it ends early
 
 and takes on stdin:
@@ -28,6 +29,7 @@ import queue
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,7 +41,8 @@ import numpy as np
 from can_dbc import e2e
 from can_dbc.bus import FOREIGN, open_bus, recv_frames
 from can_dbc.child import Stop, follow_parent, tell
-from can_dbc.codec import FORCE_CMD, MESSAGES, RUN_CTRL, choices, decode_column
+from can_dbc.codec import FORCE_CMD, MESSAGES, RUN_CTRL, choices, decode_column, get
+from can_dbc.hub_server import ERROR
 from tools.frames import FRAME, Digest, columns
 from tools.trace import Reference, TraceWriter
 
@@ -74,28 +77,30 @@ class Recorder:
         self._count = 0  # of _rows that are this run's
         self._logged = 0  # of these, in the trace
         self._logged_tick = 0
+        self._dropped = 0  # frames that the bus had dropped when the last run ended
+        self._foreign = 0  # frames of other kinds since then
 
     @property
     def frames(self) -> np.ndarray:
         """The FRAME rows of the current run so far."""
         return self._rows[: self._count]
 
-    def take(self, received: list[tuple[int, int]]) -> None:
-        """Take what `bus.recv_frames` gave."""
+    def take(self, received: list[tuple[int, int]], dropped: int = 0) -> None:
+        """Take what `bus.recv_frames` gave.
+
+        :param dropped: how many frames the bus has not been able to deliver so far.
+        """
         flat = np.fromiter(chain.from_iterable(received), np.int64, 2 * len(received))
         frame_ids, words = flat[0::2], flat[1::2]
         if (frame_ids >= FOREIGN).any():
+            self._foreign += int(np.sum((frame_ids >= FOREIGN) & (frame_ids & ERROR == 0)))
             ours = frame_ids < FOREIGN
             frame_ids, words = frame_ids[ours], words[ours]
         start = 0
-        for at in np.flatnonzero(frame_ids == RUN_CTRL.frame_id).tolist():
-            if e2e.check(int(words[at]), -1, RUN_CTRL.data_id) != e2e.OK:
-                continue
-            state = int(decode_column(words[at], RUN_CTRL.RunState))
-            number = int(decode_column(words[at], RUN_CTRL.Iteration))
+        for at, state, number in run_controls(frame_ids, words):
             if self.run is not None and (state != RUNNING or number != self.run):
                 self._append(frame_ids[start:at], words[start:at])
-                self._end_run(complete=state == ENDED and number == self.run)
+                self._end_run(state == ENDED and number == self.run, dropped)
             if self.run is None and state == RUNNING:
                 self._begin_run(number)
                 start = at
@@ -113,10 +118,13 @@ class Recorder:
         else:
             self._trace.run_summary(command["run"], command["row"])
 
-    def finish(self) -> None:
-        """End a run that was cut short, and the trace. Raises TraceError if it is incomplete."""
+    def finish(self, dropped: int = 0) -> None:
+        """End a run that was cut short, and the trace; `dropped` as in `take`.
+
+        Raises TraceError if the trace is incomplete.
+        """
         if self.run is not None:
-            self._end_run(complete=False)
+            self._end_run(False, dropped)
         if self._trace is not None:
             self._trace.close()
 
@@ -146,7 +154,7 @@ class Recorder:
         self._logged = end
         self._logged_tick = self.tick
 
-    def _end_run(self, complete: bool) -> None:
+    def _end_run(self, complete: bool, dropped: int) -> None:
         frames, number = self.frames, self.run
         assert number is not None
         self._log(self._count)
@@ -154,9 +162,11 @@ class Recorder:
         if self._keep_frames is not None:
             np.save(self._keep_frames / f"frames_{number}.npy", frames)
         lost = lost_frames(frames)
+        dropped_now = dropped - self._dropped
         if self._trace is not None:
-            if lost:
-                self._trace.text(number, self.tick, f"recorder lost frames: {lost}", "WARN")
+            if lost or dropped_now:
+                text = f"recorder lost frames: {lost}, the bus dropped {dropped_now}"
+                self._trace.text(number, self.tick, text, "WARN")
             if not complete:
                 self._trace.text(number, self.tick, f"cut short at tick {self.tick}", "WARN")
         tell(
@@ -165,16 +175,34 @@ class Recorder:
             ticks=self.tick,
             frames=len(frames),
             lost=lost,
+            dropped=dropped_now,
+            foreign=self._foreign,
             digest=self._digest.hex(),
             complete=complete,
         )
         self.run = None
+        self._dropped, self._foreign = dropped, 0
+
+
+def run_controls(frame_ids: np.ndarray, words: np.ndarray) -> Iterator[tuple[int, int, int]]:
+    """Row, run state and number of the run of each RUN_CTRL that passes its end-to-end check."""
+    for at in np.flatnonzero(frame_ids == RUN_CTRL.frame_id).tolist():
+        word = int(words[at])
+        if e2e.check(word, -1, RUN_CTRL.data_id) == e2e.OK:
+            state, number = get(word, RUN_CTRL.RunState), get(word, RUN_CTRL.Iteration)
+            yield at, int(state), int(number)
+
+
+def dropped_frames(bus: can.BusABC) -> int:
+    """How many frames the bus has not been able to deliver to this node, where it counts them."""
+    return int(getattr(bus, "frames_lost", 0))
 
 
 def lost_frames(frames: np.ndarray) -> dict[str, int]:
     """How many frames of each message are missing in a run, by their counters; only those > 0.
 
-    Fifteen frames of one message that are lost in a row are not seen.
+    Fifteen frames of one message that are lost in a row are not seen: what the bus itself counts
+    (`dropped_frames`) tells of them.
     """
     lost = {}
     for message in MESSAGES:
@@ -193,7 +221,7 @@ def record(
     while not stop.requested:
         received = recv_frames(bus, IDLE_S)
         if received:
-            recorder.take(received)
+            recorder.take(received, dropped_frames(bus))
         while not commands.empty():
             command = commands.get()
             if command["command"] == "stop":
@@ -204,7 +232,7 @@ def record(
             time.sleep(PAUSE_S)
     deadline = time.monotonic() + DRAIN_S
     while (received := recv_frames(bus, SILENCE_S)) and time.monotonic() < deadline:
-        recorder.take(received)
+        recorder.take(received, dropped_frames(bus))
 
 
 def save_settings(path: Path, reference: Reference, **settings: Any) -> None:
@@ -269,7 +297,7 @@ def main() -> int:
         tell("error", message=f"recorder: {error}")
         status = 1
     try:
-        recorder.finish()
+        recorder.finish(dropped_frames(bus))
     except (OSError, ValueError) as error:
         tell("error", message=f"recorder: {error}")
         status = 1

@@ -148,15 +148,25 @@ def _finish_run(
     truth: np.ndarray,
     seconds: float,
     faults: list[str],
+    frames_lost: int = 0,
 ) -> dict[str, Any]:
-    """The row of a run, added to the summary and shown."""
+    """The row of a run, added to the summary and shown.
+
+    `frames_lost` are frames that were on the bus and are not in `frames`.
+    """
     measured = metrics.run_metrics(
         session.loaded,
         truth,
         sil.commanded_force_n(frames, len(truth)),
         setup.error_weight(session.loaded, session.law),
     )
-    row = {"run": run, **measured, "ticks_per_s": len(truth) / seconds, "faults": faults}
+    row = {
+        "run": run,
+        **measured,
+        "ticks_per_s": len(truth) / seconds,
+        "frames_lost": frames_lost,
+        "faults": faults,
+    }
     session.summary["runs"].append(row)
     session.listener.row(row)
     return row
@@ -291,13 +301,25 @@ def _on_run(
     """Plant and recorder have both finished a run."""
     run = plant["run"]
     session.summary["digest"] = recorder["digest"]
-    lost = {name: count for name, count in recorder["lost"].items() if count}
-    if lost:
-        session.listener.note(f"run {run}: the recorder missed frames: {lost}")
+    lost, dropped = recorder["lost"], recorder["dropped"]
+    frames_lost = max(dropped, sum(lost.values()))
+    if frames_lost:
+        session.listener.note(
+            f"run {run}: the recorder missed {frames_lost} frames"
+            f" (the bus dropped {dropped}; by counters: {lost}); its digest is not that of the run"
+        )
     frames_file = kept / f"frames_{run}.npy"
     frames = np.load(frames_file)
     truth = np.load(plant["file"])
-    row = _finish_run(session, run, frames, truth, plant["seconds"], fault_names(plant["faults"]))
+    row = _finish_run(
+        session,
+        run,
+        frames,
+        truth,
+        plant["seconds"],
+        fault_names(plant["faults"]),
+        frames_lost,
+    )
     frames_file.unlink()
     tap = bench.nodes["recorder"]
     tap.command(command="truth", run=run, file=plant["file"])
