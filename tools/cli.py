@@ -192,6 +192,10 @@ def run(
         typer.Option(help="Learning memory: read if it exists, written after each run."),
     ] = None,
     trace: Annotated[bool, typer.Option(help="Write trace.rrd.")] = True,
+    record: Annotated[
+        Path | None,
+        typer.Option(help="Record every frame of the runs: FILE.blf, .asc, .log or .mf4."),
+    ] = None,
 ) -> None:
     """Run a scenario: the train follows its profile, run by run."""
     if mode is Mode.mil and os.environ.get("ATO_HIL_INTERPRETED") != "1":
@@ -200,7 +204,7 @@ def run(
         environment = {**os.environ, "ATO_HIL_INTERPRETED": "1"}
         os.execve(sys.executable, [sys.executable, "-m", "tools.cli", *sys.argv[1:]], environment)
     with one_line_for_bad_input():
-        _run(scenario, law, runs, mode, bus, seed, out, memory, trace)
+        _run(scenario, law, runs, mode, bus, seed, out, memory, trace, record)
 
 
 @contextmanager
@@ -225,6 +229,7 @@ def _run(
     out: Path | None,
     memory: Path | None,
     trace: bool,
+    record: Path | None,
 ) -> None:
     from controller.registry import law_label
     from plant_sim.scenario import load
@@ -232,10 +237,11 @@ def _run(
     from tools.hil import RunError
 
     loaded = load(scenario)
-    folder = (
-        out or Path("runs") / f"{loaded.name}-{law_label(law or loaded.scenario.law)}-{mode.value}"
+    name = law_label(law or loaded.scenario.law)
+    folder = out or Path("runs") / f"{loaded.name}-{name}-{mode.value}"
+    options = session.Options(
+        scenario, law, runs, mode.value, bus, seed, folder, memory, trace, record
     )
-    options = session.Options(scenario, law, runs, mode.value, bus, seed, folder, memory, trace)
     screen = Screen(mode)
     try:
         with screen.bar:
@@ -252,6 +258,71 @@ def _run(
     if trace:
         trace_file = folder / "trace.rrd"
         console.print(f"trace   {trace_file}   (open it with: rerun {trace_file})", soft_wrap=True)
+    if record is not None:
+        console.print(f"record  {record}   (again: ato-hil replay {record})", soft_wrap=True)
+
+
+@app.command()
+def replay(
+    recording: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Recording: .blf, .asc, .log (candump -L), .mf4.")
+    ],
+    scenario: Annotated[
+        str | None, typer.Option(help="Scenario; that of FILE.json by default.")
+    ] = None,
+    law: Annotated[
+        str | None, typer.Option(help="Control law; that of FILE.json by default.")
+    ] = None,
+    memory: Annotated[
+        Path | None,
+        typer.Option(help="Learning memory before the first run; only read."),
+    ] = None,
+    channel: Annotated[
+        str | None, typer.Option(help="The channel, if several carry our frames.")
+    ] = None,
+) -> None:
+    """Feed a recording to the controller alone; say where its commands first differ (exit 1)."""
+    with one_line_for_bad_input():
+        from tools import replay as open_loop
+
+        prepared = open_loop.prepare(recording, scenario, law, memory, channel)
+        console.print(
+            f"{prepared.loaded.name}, {prepared.calibration.law}: {len(prepared.runs)} runs",
+            soft_wrap=True,
+        )
+        for note in prepared.notes:
+            console.print(note, style="dim", soft_wrap=True, markup=False)
+        for result in open_loop.replay(prepared):
+            if result.difference is not None:
+                where = f"run {result.run}, tick {result.difference.tick}"
+                raise _fail(f"{recording}: {where}: {result.difference.text}", EXIT_BAD_INPUT)
+            console.print(
+                f"run {result.run}: {result.ticks} ticks, {result.commands} commands as recorded"
+            )
+
+
+@app.command()
+def decode(
+    recording: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Recording: .blf, .asc, .log (candump -L), .mf4.")
+    ],
+    out: Annotated[Path, typer.Option(help="Table to write: X.csv or X.parquet.")],
+    channel: Annotated[
+        str | None, typer.Option(help="The channel, if several carry our frames.")
+    ] = None,
+) -> None:
+    """Decode a recording to a table: a row for each frame, a column for each signal."""
+    with one_line_for_bad_input():
+        from tools import decode as tables
+
+        done = tables.decode(recording, out, channel)
+    console.print(f"{out}: {done.rows} frames, {len(done.messages)} messages", soft_wrap=True)
+    if done.unknown or done.foreign:
+        console.print(
+            f"left out: {done.unknown} frames that the DBC does not have,"
+            f" {done.foreign} of other kinds or channels",
+            style="dim",
+        )
 
 
 @app.command("list")

@@ -29,7 +29,6 @@ import queue
 import signal
 import sys
 import time
-from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
@@ -41,9 +40,9 @@ import numpy as np
 from can_dbc import e2e
 from can_dbc.bus import FOREIGN, open_bus, recv_frames
 from can_dbc.child import Stop, follow_parent, tell
-from can_dbc.codec import FORCE_CMD, MESSAGES, RUN_CTRL, choices, decode_column, get
+from can_dbc.codec import FORCE_CMD, MESSAGES, RUN_CTRL, decode_column
 from can_dbc.hub_server import ERROR
-from tools.frames import FRAME, Digest, columns
+from tools.frames import ENDED, FRAME, RUNNING, Digest, columns, run_controls, ticks_of
 from tools.trace import Reference, TraceWriter
 
 BATCH_TICKS = 1000  # of the trace
@@ -54,9 +53,6 @@ IDLE_S = 0.05  # longest wait for a frame, so that commands are heard
 SILENCE_S = 0.01  # at the end: the bus has nothing more
 DRAIN_S = 1.0  # at the end: longest wait for that
 FIRST_ROWS = 1 << 14
-
-RUN_STATES = choices("RUN_CTRL", "RunState")
-RUNNING, ENDED = RUN_STATES["running"], RUN_STATES["ended"]
 
 
 class Recorder:
@@ -139,13 +135,11 @@ class Recorder:
             larger[: self._count] = self.frames
             self._rows = larger
         rows = self._rows[self._count : end]
-        closes = frame_ids == FORCE_CMD.frame_id
-        closed = np.cumsum(closes)
-        rows["tick"] = self.tick + closed - closes
+        rows["tick"] = self.tick + ticks_of(frame_ids)
         rows["frame_id"] = frame_ids
         rows["payload"] = words
         self._count = end
-        self.tick += int(closed[-1]) if len(closed) else 0
+        self.tick += int(np.count_nonzero(frame_ids == FORCE_CMD.frame_id))
 
     def _log(self, end: int) -> None:
         """Bring the trace up to row `end`."""
@@ -182,15 +176,6 @@ class Recorder:
         )
         self.run = None
         self._dropped, self._foreign = dropped, 0
-
-
-def run_controls(frame_ids: np.ndarray, words: np.ndarray) -> Iterator[tuple[int, int, int]]:
-    """Row, run state and number of the run of each RUN_CTRL that passes its end-to-end check."""
-    for at in np.flatnonzero(frame_ids == RUN_CTRL.frame_id).tolist():
-        word = int(words[at])
-        if e2e.check(word, -1, RUN_CTRL.data_id) == e2e.OK:
-            state, number = get(word, RUN_CTRL.RunState), get(word, RUN_CTRL.Iteration)
-            yield at, int(state), int(number)
 
 
 def dropped_frames(bus: can.BusABC) -> int:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,8 +21,8 @@ from can_dbc.bus import choose_bus, open_bus, recv_frames
 from controller import node
 from controller.interface import fault_names
 from controller.registry import load_law
-from plant_sim.scenario import Loaded, load
-from tools import hil, metrics, setup, sil
+from plant_sim.scenario import FOLDER, Loaded, load
+from tools import hil, metrics, record, setup, sil
 from tools.frames import Digest
 from tools.hil import RunError
 from tools.lyapunov import has_lyapunov, lyapunov
@@ -29,6 +30,7 @@ from tools.recorder import save_settings
 
 SCHEMA = 1
 RUNS_MAX = 4095  # Iteration has 12 bits
+BACKLOG_RUNS = 4  # that a recording may be behind
 
 
 class SessionError(ValueError):
@@ -64,6 +66,7 @@ class Options:
     out: Path
     memory: Path | None
     trace: bool = True
+    record: Path | None = None  # recording of the frames
 
 
 @dataclass
@@ -76,14 +79,15 @@ class Session:
     runs: range
     listener: Listener
     summary: dict[str, Any] = field(default_factory=dict)
+    recording: record.Recording | None = None
 
 
 def run(options: Options, listener: Listener) -> dict[str, Any]:
     """Runs the session; returns and writes the summary.
 
-    Raises ScenarioError, LawError, CalibrationError, BusError, MemoryFileError, SessionError for
-    bad input, RunError if a run ends early (the summary then holds the runs that were completed
-    and the reason), KeyboardInterrupt likewise.
+    Raises ScenarioError, LawError, CalibrationError, BusError, MemoryFileError, RecordError,
+    SessionError for bad input, RunError if a run ends early (the summary then holds the runs that
+    were completed and the reason), KeyboardInterrupt likewise.
     """
     loaded = load(options.scenario)
     law = options.law or loaded.scenario.law
@@ -93,6 +97,8 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     runs = setup.run_numbers(law, options.runs or loaded.scenario.runs, learned)
     if runs[-1] > RUNS_MAX:
         raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
+    if options.record is not None:
+        record.check_target(options.record)
     prepare(options.out)
     listener.begin(loaded, law, runs)
     session = Session(options, loaded, law, runs, listener)
@@ -141,6 +147,30 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     os.replace(temporary, path)
 
 
+@contextmanager
+def _recording(session: Session) -> Iterator[None]:
+    """Records the runs of the session if that is asked for."""
+    options, loaded = session.options, session.loaded
+    if options.record is None:
+        yield
+        return
+    record.save_origin(
+        options.record,
+        scenario=loaded.path,
+        packaged=loaded.path.parent == FOLDER,
+        scenario_digest=loaded.digest,
+        law=session.law,
+        mode=options.mode,
+        seed=options.seed,
+        memory_file=options.memory,
+    )
+    # On a bus the next run goes on meanwhile. In one process it would only look slower for it.
+    backlog = BACKLOG_RUNS if options.mode == "hil" else 0
+    period_s = loaded.scenario.period_s
+    with record.Recording(options.record, period_s, backlog) as session.recording:
+        yield
+
+
 def _finish_run(
     session: Session,
     run: int,
@@ -154,6 +184,8 @@ def _finish_run(
 
     `frames_lost` are frames that were on the bus and are not in `frames`.
     """
+    if session.recording is not None:
+        session.recording.add(run, frames)
     measured = metrics.run_metrics(
         session.loaded,
         truth,
@@ -175,8 +207,11 @@ def _finish_run(
 def _run_in_process(session: Session, calibration: Any) -> None:
     options, loaded = session.options, session.loaded
     digest = Digest()
-    writer = _trace_writer(session) if options.trace else None
-    try:
+    with _recording(session), ExitStack() as stack:
+        writer = None
+        if options.trace:
+            writer = _trace_writer(session)
+            stack.callback(writer.close)
         for result, controller in sil.run(
             loaded,
             calibration,
@@ -201,9 +236,6 @@ def _run_in_process(session: Session, calibration: Any) -> None:
                     column = lyapunov(loaded, session.law, result.frames, result.truth)
                     writer.truth(result.run, column)
                 writer.run_summary(result.run, row)
-    finally:
-        if writer is not None:
-            writer.close()
 
 
 def _trace_settings(session: Session) -> dict[str, Any]:
@@ -251,7 +283,7 @@ def _run_hil(session: Session, calibration: Any) -> None:
     session.summary["bus"] = choice.name
     session.listener.note(f"bus {choice.name}: {choice.reason}")
     _refuse_busy_bus(choice.name)
-    with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch:
+    with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, _recording(session):
         kept = Path(scratch)
         events = hil.run(
             scenario=str(loaded.path),
@@ -263,9 +295,21 @@ def _run_hil(session: Session, calibration: Any) -> None:
             memory_file=options.memory,
             recorder_arguments=_recorder_arguments(session, kept),
         )
-        with closing(events):  # whatever ends the session ends the nodes
-            for speaker, event, bench in events:
-                _on_event(session, bench, speaker.name, event, kept)
+        try:
+            with closing(events):  # whatever ends the session ends the nodes
+                for speaker, event, bench in events:
+                    _on_event(session, bench, speaker.name, event, kept)
+        finally:
+            _record_the_rest(session, kept)
+
+
+def _record_the_rest(session: Session, kept: Path) -> None:
+    """What the recorder has of runs that were not completed."""
+    if session.recording is None:
+        return
+    for run in session.runs:
+        with suppress(OSError, ValueError):  # ValueError: the recorder was killed as it wrote
+            session.recording.add(run, np.load(kept / f"frames_{run}.npy"))
 
 
 def _refuse_busy_bus(name: str) -> None:
@@ -307,6 +351,11 @@ def _on_run(
         session.listener.note(
             f"run {run}: the recorder missed {frames_lost} frames"
             f" (the bus dropped {dropped}; by counters: {lost}); its digest is not that of the run"
+        )
+    if session.recording is not None and recorder["foreign"]:
+        session.listener.note(
+            f"run {run}: {recorder['foreign']} frames that are not standard data frames of 8 bytes"
+            " are not in the recording"
         )
     frames_file = kept / f"frames_{run}.npy"
     frames = np.load(frames_file)

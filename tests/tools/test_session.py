@@ -61,10 +61,16 @@ def channel(tmp_path: Path) -> str:
 
 
 def test_hil_gives_the_bits_of_sil(short: Path, tmp_path: Path) -> None:
-    sil = ato_hil("run", str(short), "--mode", "sil", "--out", "sil", cwd=tmp_path)
+    sil = ato_hil(
+        *("run", str(short), "--mode", "sil", "--out", "sil", "--record", "sil.log"), cwd=tmp_path
+    )
     assert sil.returncode == 0, sil.stderr
-    hil = ato_hil("run", str(short), "--bus", channel(tmp_path), "--out", "hil", cwd=tmp_path)
+    hil = ato_hil(
+        *("run", str(short), "--bus", channel(tmp_path), "--out", "hil", "--record", "hil.log"),
+        cwd=tmp_path,
+    )
     assert hil.returncode == 0, hil.stderr
+    assert (tmp_path / "sil.log").read_bytes() == (tmp_path / "hil.log").read_bytes()
     one, other = summary(tmp_path / "sil"), summary(tmp_path / "hil")
     assert one["digest"] == other["digest"]
     for a, b in zip(one["runs"], other["runs"], strict=True):
@@ -145,6 +151,8 @@ def test_learning_goes_on_from_a_memory_file(short: Path, tmp_path: Path) -> Non
         (["run", "subway", "--bus", "virtual:x"], "lives inside one process"),
         (["run", "subway", "--memory", "foreign.bin"], "foreign.bin: not a learning memory"),
         (["run", "subway", "--out", "a-file/x"], "a-file/x: cannot write there"),
+        (["run", "subway", "--record", "x.pcap"], "x.pcap: expected a name that ends in .blf, "),
+        (["run", "subway", "--record", "no/x.blf"], "no/x.blf: there is no folder"),
     ],
 )
 def test_bad_input_is_one_clear_line(tmp_path: Path, arguments: list[str], says: str) -> None:
@@ -200,6 +208,8 @@ def start_long_run(tmp_path: Path) -> subprocess.Popen[str]:
             "out",
             "--bus",
             channel(tmp_path),
+            "--record",
+            "cut.blf",
         ],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
@@ -265,6 +275,12 @@ def test_what_ends_a_run_early_is_named_and_leaves_nothing_behind(
             check=False,
         )
         assert check.returncode == 0, check.stderr
+    if victim is None:
+        # Nothing is missing in what was recorded of the run that was cut short.
+        again = ato_hil("replay", "cut.blf", cwd=tmp_path)
+        assert again.returncode == 0, again.stderr
+        assert "missing" not in again.stdout
+        assert "commands as recorded" in again.stdout.splitlines()[-1]
 
 
 def test_two_sessions_do_not_share_a_bus(tmp_path: Path) -> None:
