@@ -10,15 +10,17 @@ the session began with a learning memory.
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import logging
 import os
 import queue
 import shutil
 import struct
+import sys
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -41,6 +43,7 @@ FORMATS = {
 EXPECTED = "expected a name that ends in .blf, .asc, .log or .mf4"
 CHANNEL = 0  # python-can's first; "can0" in a .log
 BATCH_FRAMES = 10_000
+MDF_HEADER_BYTES = 64 + 104  # blocks ID and HD, which every file begins with
 SCHEMA = 1
 
 
@@ -159,7 +162,7 @@ class Recording:
             raise RecordError(f"{path}: cannot be written: {error.strerror}") from None
         self._start_tick = 0  # of the next run
         self._last_run = -1
-        self._error: OSError | None = None
+        self._error: Exception | None = None
         self._runs: queue.SimpleQueue[tuple[int, np.ndarray] | None] = queue.SimpleQueue()
         self._room = threading.Semaphore(backlog_runs)
         self._thread = threading.Thread(target=self._write_all, daemon=True, name="recording")
@@ -190,11 +193,11 @@ class Recording:
 
     def _raise_error(self) -> None:
         if self._error is not None:
-            reason = self._error.strerror or self._error
+            reason = getattr(self._error, "strerror", None) or self._error
             raise RecordError(f"{self._path}: cannot be written: {reason}") from None
 
     def _write_all(self) -> None:
-        with suppress(OSError):  # Linux: of this thread alone; the nodes come first
+        if sys.platform == "linux":  # where it is that of one thread: the nodes come first
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
         while (item := self._runs.get()) is not None:
             run, frames = item
@@ -202,12 +205,12 @@ class Recording:
                 if run > self._last_run and self._error is None and len(frames):
                     self._last_run = run
                     self._write_run(frames)
-            except OSError as error:
+            except Exception as error:  # the writers and asammdf raise what they like
                 self._error = error
             self._room.release()
         try:
             self._writer.stop()
-        except OSError as error:
+        except Exception as error:
             self._error = self._error or error
 
     def _write_run(self, frames: np.ndarray) -> None:
@@ -305,22 +308,38 @@ def read(path: Path, channel: str | None = None) -> Recorded:
 def _messages(path: Path) -> Iterator[can.Message]:
     """All messages of a log. Raises RecordError."""
     count = 0
-    logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # what it logs, it raises as well
+    failure = ""
+    with _quiet_asammdf() if path.suffix.lower() == ".mf4" else nullcontext():
+        try:
+            _refuse_cut_off(path)
+            with can.LogReader(str(path)) as reader:
+                for message in reader:
+                    yield message
+                    count += 1
+        except RecordError:
+            raise
+        except OSError as error:
+            failure = f"cannot be read: {error.strerror or error}"
+        except Exception as error:  # the readers and asammdf raise what they like
+            reason = " ".join(str(error).split()) or type(error).__name__
+            what = FORMATS[path.suffix.lower()]
+            where = f"damaged after frame {count}" if count else f"damaged, or not {what}"
+            failure = f"{where}: {reason}"
+    if failure:
+        raise RecordError(f"{path}: {failure}")
+
+
+@contextmanager
+def _quiet_asammdf() -> Iterator[None]:
+    """Keep asammdf from printing tracebacks of what it raises, also as it deletes its objects."""
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL)
+    hook = sys.unraisablehook
+    sys.unraisablehook = lambda _: None
     try:
-        _refuse_cut_off(path)
-        with can.LogReader(str(path)) as reader:
-            for message in reader:
-                yield message
-                count += 1
-    except RecordError:
-        raise
-    except OSError as error:
-        raise RecordError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except Exception as error:  # the readers and asammdf raise what they like
-        reason = " ".join(str(error).split()) or type(error).__name__
-        what = FORMATS[path.suffix.lower()]
-        where = f"damaged after frame {count}" if count else f"damaged, or not {what}"
-        raise RecordError(f"{path}: {where}: {reason}") from None
+        yield
+    finally:
+        gc.collect()
+        sys.unraisablehook = hook
 
 
 def _refuse_cut_off(path: Path) -> None:
@@ -335,8 +354,11 @@ def _refuse_cut_off(path: Path) -> None:
             (said,) = struct.unpack_from("<Q", head.ljust(24, b"\0"), 16)
             if said > size:
                 raise RecordError(f"{path}: is cut off: {size} bytes of {said}")
-        if suffix == ".mf4" and not head.startswith((b"MDF ", b"UnFinMF ")):
-            raise RecordError(f"{path}: is not {FORMATS[suffix]}")
+        if suffix == ".mf4":
+            if not head.startswith((b"MDF ", b"UnFinMF ")):
+                raise RecordError(f"{path}: is not {FORMATS[suffix]}")
+            if size < MDF_HEADER_BYTES:
+                raise RecordError(f"{path}: is cut off: {size} bytes")
         if suffix in (".asc", ".log"):
             stream.seek(-1, os.SEEK_END)
             if stream.read(1) != b"\n":

@@ -23,7 +23,6 @@ from can_dbc.codec import (
     RUN_CTRL,
     TRAIN_POSITION,
     database,
-    decode_column,
     get,
     put,
 )
@@ -234,13 +233,13 @@ def _compared(answered: np.void, recorded: np.void) -> str:
         return f"the controller sends {_name(answered)}, the recording has {_name(recorded)}"
     message = MESSAGES[INDEX_OF_FRAME_ID[int(answered["frame_id"])]]
     source = database().get_message_by_name(message.name)
-    now, then = np.int64(answered["payload"]), np.int64(recorded["payload"])
+    words = int(answered["payload"]), int(recorded["payload"])
     texts: dict[str, str] = {}
     for signal in source.signals:
-        if not _carried(message, signal.name, now):
+        if not _carried(message, signal.name, words[0]):
             continue
         layout = getattr(message, signal.name)
-        raw = [int(decode_column(word, layout)) for word in (now, then)]
+        raw = [int(get(word, layout)) for word in words]
         if raw[0] != raw[1]:
             unit = f" {signal.unit}" if signal.unit else ""
             one, other = (_value(each, layout.scale) for each in raw)
@@ -250,11 +249,9 @@ def _compared(answered: np.void, recorded: np.void) -> str:
     return "; ".join(telling or texts.values()) or f"{message.name} differs in unused bits"
 
 
-def _carried(message: Any, signal: str, word: np.int64) -> bool:
+def _carried(message: Any, signal: str, word: int) -> bool:
     selector = multiplexed_by(message.name, signal)
-    if selector is None:
-        return True
-    return int(decode_column(word, getattr(message, selector[0]))) == selector[1]
+    return selector is None or get(word, getattr(message, selector[0])) == selector[1]
 
 
 def _value(raw: int, scale: float) -> str:

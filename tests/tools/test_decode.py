@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import can
 import pyarrow as pa
@@ -41,7 +42,7 @@ def test_every_value_is_that_of_cantools(recorded: Path, tmp_path: Path) -> None
     with can.LogReader(recorded) as reader:
         for row, message in zip(rows, reader, strict=False):
             source = database().get_message_by_frame_id(message.arbitration_id)
-            expected = source.decode(bytes(message.data), decode_choices=False)
+            expected: Any = source.decode(bytes(message.data), decode_choices=False)
             assert row["message"] == source.name
             assert row["time_s"] == message.timestamp
             for name, value in expected.items():

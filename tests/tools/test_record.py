@@ -82,10 +82,14 @@ def test_other_tools_read_the_recording(recorded: Path) -> None:
 def test_what_replay_needs_lies_beside_the_recording(record_session, tmp_path: Path) -> None:
     memory = tmp_path / "learned.bin"
     record_session(tmp_path, "first.log", 1, memory)
-    assert record.load_origin(tmp_path / "first.log").memory is None  # there was none to begin with
+    first = record.load_origin(tmp_path / "first.log")
+    assert first is not None
+    assert first.memory is None  # there was none to begin with
     before = memory.read_bytes()
     record_session(tmp_path, "second.log", 1, memory)
     origin = record.load_origin(tmp_path / "second.log")
+    assert origin is not None
+    assert origin.memory is not None
     assert origin.scenario == str(tmp_path / "short.toml")
     assert (origin.law, origin.seed, origin.mode) == ("cailc", 1, "sil")
     assert (tmp_path / origin.memory).read_bytes() == before
@@ -138,6 +142,19 @@ def test_a_full_disk_is_said(tmp_path: Path) -> None:
         session()
 
 
+def test_whatever_a_writer_raises_is_said(tmp_path: Path, monkeypatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("this is why")
+
+    def session() -> None:
+        with Recording(tmp_path / "x.log", 0.01) as recording:
+            recording.add(1, frames((0, 1, 1)))
+
+    monkeypatch.setattr(record, "write_frames", broken)
+    with pytest.raises(RecordError, match=r"x.log: cannot be written: this is why"):
+        session()
+
+
 def test_where_no_recording_can_be_written(tmp_path: Path) -> None:
     for name, says in (
         ("x.foo", "expected a name that ends in .blf, .asc, .log or .mf4"),
@@ -152,7 +169,7 @@ def test_where_no_recording_can_be_written(tmp_path: Path) -> None:
 
 
 def test_mf4_without_its_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(record.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(RecordError, match=r"x.mf4: .mf4 needs asammdf: pip install 'ato-hil\[mf4]"):
         record.check_suffix(Path("x.mf4"))
 
@@ -276,7 +293,6 @@ rows["payload"] = np.random.default_rng(1).integers(-2**63, 2**63 - 1, 2500)
 with record.Recording(Path("ours.mf4"), 0.01) as recording:
     recording.add(1, rows)
 with MF4Writer("theirs.mf4") as writer:
-    record.write_frames(writer, rows["tick"] * 0.01, rows[:0])
     data = rows["payload"].tobytes()
     for at, row in enumerate(rows):
         writer(can.Message(
