@@ -18,6 +18,7 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from plant_sim.scenario import Loaded
+    from tools.bus_report import Report as BusReport
     from tools.verify import Row
 
 app = typer.Typer(
@@ -450,6 +451,62 @@ def claims(
     surprises = [row.text for row in rows if row.holds != row.expected]
     if surprises:
         raise _fail(f"otherwise than found before: {'; '.join(surprises)}", EXIT_BAD_INPUT)
+
+
+@app.command("bus-report")
+def bus_report(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario or a .toml file.")],
+    law: Annotated[str | None, typer.Option(help="Control law; the scenario's by default.")] = None,
+    bitrate: Annotated[
+        int, typer.Option(min=10_000, max=1_000_000, help="Of the wire, bit/s.")
+    ] = 500_000,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, not a table.")] = False,
+) -> None:
+    """Say what a scenario's messages ask of a CAN wire: load and worst-case response times."""
+    import json
+
+    from controller.registry import load_law
+    from plant_sim.scenario import load
+    from tools.bus_report import report
+
+    with one_line_for_bad_input():
+        loaded = load(scenario)
+        name = law or loaded.scenario.law
+        load_law(name)
+        with console.status("finding out what is sent ..."):
+            found = report(loaded, name, bitrate)
+    if as_json:
+        typer.echo(json.dumps(found.as_json(), indent=1))
+    else:
+        _print_bus_report(found)
+    if found.complaints:
+        raise _fail(f"{bitrate} bit/s: {'; '.join(found.complaints)}", EXIT_BAD_INPUT)
+
+
+def _print_bus_report(found: BusReport) -> None:
+    headings = ("id", "message", "bytes", "frames\na tick", "cycle\nms", "frame\nbits", "load\n%")
+    table = Table(*headings, "response\nms", "deadline\nms", "margin\nms", header_style="bold")
+    for column in table.columns:
+        column.justify = "right"
+    table.columns[1].justify = "left"
+    for row in found.rows:
+        table.add_row(
+            f"{row.frame_id:#05x}",
+            row.message,
+            f"{row.data_bytes}",
+            f"{row.frames_per_tick:.2f}",
+            f"{row.cycle_ms:g}",
+            f"{row.frame_bits}",
+            f"{100 * row.load:.2f}",
+            "no bound" if row.response_ms is None else f"{row.response_ms:.3f}",
+            f"{row.cycle_ms:g}",
+            "-" if row.margin_ms is None else f"{row.margin_ms:.3f}",
+            style=None if row.meets_deadline else "red",
+        )
+    table.add_section()
+    load = f"{100 * found.load:.2f}"
+    table.add_row("", "all", "", f"{found.frames_per_tick:.2f}", "", "", load, "", "", "")
+    console.print(table)
 
 
 @app.command()
