@@ -45,6 +45,13 @@ class Mode(StrEnum):
     mil = "mil"
 
 
+class External(StrEnum):
+    """A node that is not ours."""
+
+    controller = "controller"
+    plant = "plant"
+
+
 class Pace(StrEnum):
     """Who keeps the time."""
 
@@ -197,6 +204,10 @@ def run(
         Path | None,
         typer.Option(help="Record every frame of the runs: FILE.blf, .asc, .log or .mf4."),
     ] = None,
+    external: Annotated[
+        list[External] | None,
+        typer.Option(help="A node of your own, started by yourself; may be given twice."),
+    ] = None,
 ) -> None:
     """Run a scenario: the train follows its profile, run by run."""
     if mode is Mode.mil and os.environ.get("ATO_HIL_INTERPRETED") != "1":
@@ -205,7 +216,8 @@ def run(
         environment = {**os.environ, "ATO_HIL_INTERPRETED": "1"}
         os.execve(sys.executable, [sys.executable, "-m", "tools.cli", *sys.argv[1:]], environment)
     with one_line_for_bad_input():
-        _run(scenario, law, runs, mode, bus, seed, out, memory, trace, record)
+        nodes = tuple(dict.fromkeys(node.value for node in external or ()))
+        _run(scenario, law, runs, mode, bus, seed, out, memory, trace, record, nodes)
 
 
 @contextmanager
@@ -231,6 +243,7 @@ def _run(
     memory: Path | None,
     trace: bool,
     record: Path | None,
+    external: tuple[str, ...],
 ) -> None:
     from controller.registry import law_label
     from plant_sim.scenario import load
@@ -238,10 +251,13 @@ def _run(
     from tools.hil import RunError
 
     loaded = load(scenario)
-    name = law_label(law or loaded.scenario.law)
+    if External.controller in external:
+        name = session.EXTERNAL_LAW
+    else:
+        name = law_label(law or loaded.scenario.law)
     folder = out or Path("runs") / f"{loaded.name}-{name}-{mode.value}"
     options = session.Options(
-        scenario, law, runs, mode.value, bus, seed, folder, memory, trace, record
+        scenario, law, runs, mode.value, bus, seed, folder, memory, trace, record, external
     )
     screen = Screen(mode)
     try:
@@ -254,6 +270,8 @@ def _run(
         _print_table(screen)
         raise _fail(f"interrupted; the runs so far are in {folder}", EXIT_INTERRUPTED) from None
     _print_table(screen)
+    if External.plant in external:
+        console.print("errors and energy are what the bus shows: measured, commanded")
     console.print(f"digest  {summary['digest']}")
     console.print(f"summary {folder / 'summary.json'}", soft_wrap=True)
     if trace:
@@ -343,6 +361,33 @@ def list_scenarios() -> None:
     except ScenarioError as error:
         raise _fail(str(error), EXIT_BAD_INPUT) from None
     console.print(table)
+
+
+@app.command()
+def profile(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario or a .toml file.")],
+) -> None:
+    """Print the reference profile and the limit of each control period as CSV, for nodes of your
+    own."""
+    import numpy as np
+
+    from plant_sim.planner import limit_at
+    from plant_sim.scenario import load
+
+    with one_line_for_bad_input():
+        loaded = load(scenario)
+        plan, reference = loaded.scenario.profile, loaded.profile
+        limit_m_s = limit_at(plan.limits, np.arange(loaded.ticks), loaded.scenario.period_s)
+    columns = {
+        "position_m": reference.position_m,
+        "speed_m_s": reference.speed_m_s,
+        "acceleration_m_s2": reference.acceleration_m_s2,
+        "permitted_speed_m_s": limit_m_s,
+    }
+    lines = [",".join(["tick", *columns])]
+    for tick, row in enumerate(zip(*columns.values(), strict=True)):
+        lines.append(",".join([f"{tick}", *(f"{value:.7f}" for value in row)]))
+    typer.echo("\n".join(lines))
 
 
 @app.command()

@@ -87,6 +87,15 @@ def decode(frames: np.ndarray, message: Any, signal: str) -> tuple[np.ndarray, n
     return ticks, physical(words, message, signal)
 
 
+def held(frames: np.ndarray, ticks: int, message: Any, signal: str) -> np.ndarray:
+    """Physical values (float64) of one signal in ticks 0 to `ticks` - 1; a tick without the frame
+    repeats the last, and is 0 before the first."""
+    at, values = decode(frames[frames["tick"] < ticks], message, signal)
+    row = np.zeros(ticks, np.int64)
+    row[at] = np.arange(1, len(at) + 1)
+    return np.concatenate(([0.0], values))[np.maximum.accumulate(row)]
+
+
 def physical(words: np.ndarray, message: Any, signal: str) -> np.ndarray:
     """Physical values (float64, unit of the DBC) of one signal in a column of mailbox words."""
     layout = getattr(message, signal)

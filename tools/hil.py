@@ -1,5 +1,6 @@
 """HIL: recorder, controller and plant as processes of their own on one bus; this process starts,
-watches and ends them.
+watches and ends them. A controller or plant that is not ours is started by its owner; an observer
+watches it instead.
 
 A process that dies, a node that falls silent or Ctrl-C ends the run within two seconds, names the
 cause, keeps the traces so far, and leaves no process and no socket behind.
@@ -14,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Generator
+from collections.abc import Collection, Generator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,8 +23,11 @@ from typing import IO, Any
 
 from controller import calibration as calibrations
 from controller.calibration import Calibration
+from tools.observer import CONTROLLER, PATIENCE_S, PLANT
 
 READY_TIMEOUT_S = 300.0  # the first start compiles
+# The plant's own limit while the observer judges a foreign controller, and names what is wrong.
+EXTERNAL_TIMEOUT_S = 3.0
 STOP_TIMEOUT_S = 0.7  # of a node that was asked to end
 RECORDER_TIMEOUT_S = 20.0  # from the end of the last run to the recorder's account of it
 
@@ -52,7 +56,7 @@ class Node:
 
 
 class Bench:
-    """The three nodes of one run. Use as a context manager: leaving it ends every node."""
+    """The nodes of one run. Use as a context manager: leaving it ends every node."""
 
     def __init__(self, out: Path) -> None:
         self.out = out
@@ -118,9 +122,9 @@ class Bench:
                 raise RunError(f"{', '.join(late)} not ready within {READY_TIMEOUT_S:g} s")
 
     def end(self) -> None:
-        """Ends plant and controller, then the recorder, which writes what it has; kills what does
-        not end."""
-        for name in ("plant", "controller"):
+        """Ends the other nodes, then the recorder, which writes what it has; kills what does not
+        end."""
+        for name in (PLANT, CONTROLLER, "observer"):
             self._end(name, STOP_TIMEOUT_S)
         recorder = self.nodes.get("recorder")
         if recorder is not None and recorder.process.poll() is None:
@@ -166,46 +170,58 @@ def flash(calibration: Calibration, folder: Path) -> Path:
 def run(
     *,
     scenario: str,
-    calibration: Calibration,
+    calibration: Calibration | None,
     bus: str,
     runs: range,
     seed: int,
     out: Path,
     memory_file: Path | None,
     recorder_arguments: list[str],
+    external: Collection[str] = (),
+    cars: int = 0,
 ) -> Generator[tuple[Node, dict[str, Any], Bench], None, None]:
-    """Events of the nodes until all runs are done and recorded; see the `tell` calls of the
-    processes.
+    """Events of the nodes, `ready` of each first, until all runs are done and recorded; see the
+    `tell` calls of the processes.
+
+    `calibration` is None where the controller is one of the `external` nodes; `cars` are those
+    that the plant takes a force for, each by itself.
 
     Raises RunError with one line if a node dies, falls silent or reports an error.
     """
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, Bench(out) as bench:
-        calibration_file = flash(calibration, Path(scratch))
         recorder = bench.start("recorder", ["tools.recorder", "--bus", bus, *recorder_arguments])
-        controller_arguments = ["--calibration", str(calibration_file), "--bus", bus]
-        if memory_file is not None:
-            controller_arguments += ["--memory", str(memory_file)]
-        bench.start("controller", ["controller.process", *controller_arguments])
-        plant = bench.start(
-            "plant",
-            [
-                "plant_sim.process",
-                *("--scenario", scenario),
-                *("--bus", bus),
-                *("--seed", str(seed)),
-                *("--first-run", str(runs[0])),
-                *("--last-run", str(runs[-1])),
-                *("--out", scratch),
-            ],
-        )
+        if external:
+            watched = [word for name in external for word in ("--external", name)]
+            watched += ["--cars", str(cars), "--runs", str(len(runs))]
+            leader = bench.start("observer", ["tools.observer", "--bus", bus, *watched])
+        if calibration is not None:
+            controller_arguments = ["--calibration", str(flash(calibration, Path(scratch)))]
+            if memory_file is not None:
+                controller_arguments += ["--memory", str(memory_file)]
+            bench.start(CONTROLLER, ["controller.process", "--bus", bus, *controller_arguments])
+        if PLANT not in external:
+            plant_arguments = ["--scenario", scenario, "--seed", str(seed), "--out", scratch]
+            plant_arguments += ["--first-run", str(runs[0]), "--last-run", str(runs[-1])]
+            if CONTROLLER in external:
+                plant_arguments += ["--patience", f"{PATIENCE_S + EXTERNAL_TIMEOUT_S}"]
+                plant_arguments += ["--timeout", f"{EXTERNAL_TIMEOUT_S}"]
+            leader = bench.start(PLANT, ["plant_sim.process", "--bus", bus, *plant_arguments])
         bench.wait_ready()
-        plant.command(command="start")
+        for node in bench.nodes.values():
+            yield node, node.said["ready"], bench
+        leader.command(command="start")
         deadline = None
-        while "done" not in plant.said or recorder.said.get("run", {}).get("run") != runs[-1]:
+        while "done" not in leader.said or _last_run(recorder) != _last_run(leader):
             got = bench.next_event(0.5)
             if got is not None:
                 yield (*got, bench)
-            if "done" in plant.said:
+            if "done" in leader.said:
                 deadline = deadline or time.monotonic() + RECORDER_TIMEOUT_S
                 if time.monotonic() > deadline:  # it may have lost just the frame that says so
-                    raise RunError(f"the recorder has not seen the end of run {runs[-1]}")
+                    raise RunError(f"the recorder has not seen the end of run {_last_run(leader)}")
+
+
+def _last_run(node: Node) -> int | None:
+    """The last run that a node has told the end of."""
+    run: int | None = node.said.get("run", {}).get("run")
+    return run

@@ -1,7 +1,8 @@
 """One session: the runs of one scenario and law in one mode, with their trace and summary.
 
 Modes: `sil` (one compiled loop), `mil` (the same loop interpreted, in a process started with
-ATO_HIL_INTERPRETED=1), `hil` (three processes on a bus). All give the same digest.
+ATO_HIL_INTERPRETED=1), `hil` (three processes on a bus). All give the same digest. In HIL
+plant or controller, or both, may be external: started by their owner, known by their frames alone.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 
 from can_dbc.bus import choose_bus, open_bus, recv_frames
 from controller import node
+from controller.calibration import Calibration
 from controller.interface import fault_names
 from controller.registry import load_law
 from plant_sim.scenario import FOLDER, Loaded, load
@@ -26,9 +28,11 @@ from tools import hil, metrics, record, setup, sil
 from tools.frames import Digest
 from tools.hil import RunError
 from tools.lyapunov import has_lyapunov, lyapunov
+from tools.observer import CONTROLLER, PATIENCE_S, PLANT, measured_truth
 from tools.recorder import save_settings
 
 SCHEMA = 1
+EXTERNAL_LAW = "external"  # of a controller that is not ours
 RUNS_MAX = 4095  # Iteration has 12 bits
 BACKLOG_RUNS = 4  # that a recording may be behind
 
@@ -67,6 +71,7 @@ class Options:
     memory: Path | None
     trace: bool = True
     record: Path | None = None  # recording of the frames
+    external: tuple[str, ...] = ()  # nodes that are not ours: plant, controller
 
 
 @dataclass
@@ -90,11 +95,7 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     were completed and the reason), KeyboardInterrupt likewise.
     """
     loaded = load(options.scenario)
-    law = options.law or loaded.scenario.law
-    load_law(law)
-    calibration = setup.calibration_for(loaded, law)
-    learned = -1 if options.memory is None else node.last_iteration(calibration, options.memory)
-    runs = setup.run_numbers(law, options.runs or loaded.scenario.runs, learned)
+    law, calibration, runs = _controller(options, loaded)
     if runs[-1] > RUNS_MAX:
         raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
     if options.record is not None:
@@ -108,6 +109,7 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         "law": law,
         "mode": options.mode,
         "bus": "none",
+        "external": list(options.external),
         "pace": "lockstep",
         "seed": options.seed,
         "digest": "",
@@ -128,6 +130,22 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     finally:
         write_json(options.out / "summary.json", session.summary)
     return session.summary
+
+
+def _controller(options: Options, loaded: Loaded) -> tuple[str, Calibration | None, range]:
+    """The law, what the controller is flashed with, and the numbers of the runs."""
+    if options.external and options.mode != "hil":
+        raise SessionError(f"an external node needs mode hil, this is {options.mode}")
+    count = options.runs or loaded.scenario.runs
+    if CONTROLLER in options.external:
+        if options.law is not None or options.memory is not None:
+            raise SessionError("law and memory of an external controller are its own")
+        return EXTERNAL_LAW, None, range(1, count + 1)
+    law = options.law or loaded.scenario.law
+    load_law(law)
+    calibration = setup.calibration_for(loaded, law)
+    learned = -1 if options.memory is None else node.last_iteration(calibration, options.memory)
+    return law, calibration, setup.run_numbers(law, count, learned)
 
 
 def prepare(out: Path) -> None:
@@ -241,17 +259,21 @@ def _run_in_process(session: Session, calibration: Any) -> None:
 def _trace_settings(session: Session) -> dict[str, Any]:
     """What a trace needs to know, as TraceWriter takes it."""
     loaded, law = session.loaded, session.law
-    module = load_law(law)
+    estimates = () if law == EXTERNAL_LAW else load_law(law).ESTIMATES
     return {
         "title": f"{loaded.name}, {law}, {session.options.mode}",
         "first_run": session.runs[0],
         "last_run": session.runs[-1],
         "period_s": loaded.scenario.period_s,
-        "estimates": [f"{name} [{unit}]" for name, unit, _q in module.ESTIMATES],
-        "cars": len(loaded.scenario.train.effectiveness)
-        if loaded.scenario.control.distribute
-        else 0,
+        "estimates": [f"{name} [{unit}]" for name, unit, _q in estimates],
+        "cars": _cars(loaded),
     }
+
+
+def _cars(loaded: Loaded) -> int:
+    """Cars that get a force of their own."""
+    scenario = loaded.scenario
+    return len(scenario.train.effectiveness) if scenario.control.distribute else 0
 
 
 def _trace_writer(session: Session) -> Any:
@@ -282,7 +304,8 @@ def _run_hil(session: Session, calibration: Any) -> None:
         )
     session.summary["bus"] = choice.name
     session.listener.note(f"bus {choice.name}: {choice.reason}")
-    _refuse_busy_bus(choice.name)
+    if PLANT not in options.external:  # which may well be there, and announce itself
+        _refuse_busy_bus(choice.name)
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, _recording(session):
         kept = Path(scratch)
         events = hil.run(
@@ -294,6 +317,8 @@ def _run_hil(session: Session, calibration: Any) -> None:
             out=options.out,
             memory_file=options.memory,
             recorder_arguments=_recorder_arguments(session, kept),
+            external=options.external,
+            cars=_cars(loaded),
         )
         try:
             with closing(events):  # whatever ends the session ends the nodes
@@ -325,25 +350,34 @@ def _on_event(
     session: Session, bench: hil.Bench, name: str, event: dict[str, Any], kept: Path
 ) -> None:
     kind = event["event"]
+    leader = "observer" if PLANT in session.options.external else PLANT
     if kind == "progress":
         session.listener.progress(event["run"], event["tick"])
-    elif kind == "ready" and name == "controller":
+    elif kind == "ready" and name == CONTROLLER:
         session.summary["controller"] = {
             "state_bytes": event["state_bytes"],
             "memory_bytes": event["memory_bytes"],
         }
-    elif name in ("plant", "recorder") and kind == "run":
-        plant, recorder = bench.nodes["plant"].said, bench.nodes["recorder"].said
+    elif kind == "ready" and name == "observer":
+        nodes = " and ".join(session.options.external)
+        session.listener.note(f"ready; the {nodes} may join within {PATIENCE_S:g} s")
+    elif name in (leader, "recorder") and kind == "run":
+        led, recorder = bench.nodes[leader].said, bench.nodes["recorder"].said
         run = event["run"]
-        if plant.get("run", {}).get("run") == run and recorder.get("run", {}).get("run") == run:
-            _on_run(session, bench, plant["run"], recorder["run"], kept)
+        if led.get("run", {}).get("run") == run and recorder.get("run", {}).get("run") == run:
+            _on_run(session, bench, led["run"], recorder["run"], kept)
 
 
 def _on_run(
-    session: Session, bench: hil.Bench, plant: dict[str, Any], recorder: dict[str, Any], kept: Path
+    session: Session, bench: hil.Bench, led: dict[str, Any], recorder: dict[str, Any], kept: Path
 ) -> None:
-    """Plant and recorder have both finished a run."""
-    run = plant["run"]
+    """The node that leads the runs, and the recorder, have both finished one."""
+    run = led["run"]
+    if session.options.external and recorder["ticks"] != led["ticks"]:
+        raise RunError(
+            f"run {run} has {led['ticks']} ticks, the recorder heard {recorder['ticks']}:"
+            " it began before the recorder was ready, or frames were lost"
+        )
     session.summary["digest"] = recorder["digest"]
     lost, dropped = recorder["lost"], recorder["dropped"]
     frames_lost = max(dropped, sum(lost.values()))
@@ -359,21 +393,18 @@ def _on_run(
         )
     frames_file = kept / f"frames_{run}.npy"
     frames = np.load(frames_file)
-    truth = np.load(plant["file"])
-    row = _finish_run(
-        session,
-        run,
-        frames,
-        truth,
-        plant["seconds"],
-        fault_names(plant["faults"]),
-        frames_lost,
-    )
     frames_file.unlink()
     tap = bench.nodes["recorder"]
-    tap.command(command="truth", run=run, file=plant["file"])
-    if has_lyapunov(session.loaded, session.law):
-        lyapunov_file = kept / f"lyapunov_{run}.npy"
-        np.save(lyapunov_file, lyapunov(session.loaded, session.law, frames, truth))
-        tap.command(command="truth", run=run, file=str(lyapunov_file))
+    if PLANT in session.options.external:
+        truth = measured_truth(frames, led["ticks"], session.loaded.scenario.period_s)
+    else:
+        truth = np.load(led["file"])
+        tap.command(command="truth", run=run, file=led["file"])
+        if session.law != EXTERNAL_LAW and has_lyapunov(session.loaded, session.law):
+            lyapunov_file = kept / f"lyapunov_{run}.npy"
+            np.save(lyapunov_file, lyapunov(session.loaded, session.law, frames, truth))
+            tap.command(command="truth", run=run, file=str(lyapunov_file))
+    row = _finish_run(
+        session, run, frames, truth, led["seconds"], fault_names(led["faults"]), frames_lost
+    )
     tap.command(command="summary", run=run, row=row)
