@@ -14,7 +14,7 @@ from typing import Any
 
 from link import Link, options, read_profile, run
 
-KP, KI, KD = 0.6, 0.1, 1.4  # 1/s^2, 1/s^3, 1/s: m/s^2 for m, m s, m/s
+KP, KI, KD = 1.0, 0.25, 2.0  # 1/s^2, 1/s^3, 1/s: m/s^2 for m, m s, m/s
 FORCE_MAX_M_S2 = 1.2
 PERIOD_S = 0.01
 

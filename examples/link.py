@@ -78,7 +78,9 @@ def read_profile(path: Path) -> list[dict[str, float]]:
         except (KeyError, TypeError, ValueError):
             rows = []
     if not rows:
-        raise ValueError(f"{path}: line {reader.line_num}: expected numbers for {COLUMNS}")
+        raise ValueError(
+            f"{path}: line {reader.line_num}: expected numbers for {', '.join(COLUMNS)}"
+        )
     return rows
 
 

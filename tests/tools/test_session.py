@@ -9,10 +9,15 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from tools.cli import Mode, Screen
+from tools.session import Options, SessionError, run
 
 SHORT = """
 base = "subway-fast"
@@ -175,6 +180,30 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, arguments: list[str], says:
     assert says in done.stderr
     assert "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ({"mode": "sil", "external": ("plant",)}, "needs mode hil, this is sil"),
+        ({"law": "pid", "external": ("controller",)}, "law and memory .* are its own"),
+        ({"memory": Path("m"), "external": ("controller",)}, "law and memory .* are its own"),
+    ],
+)
+def test_options_that_do_not_go_together(tmp_path: Path, more: dict[str, Any], says: str) -> None:
+    options = Options(
+        scenario="subway",
+        law=None,
+        runs=None,
+        mode="hil",
+        bus="hub",
+        seed=1,
+        out=tmp_path / "out",
+        memory=None,
+    )
+    with pytest.raises(SessionError, match=says):
+        run(replace(options, **more), Screen(Mode.hil))
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_dbc_without_a_needed_signal_is_one_clear_line(tmp_path: Path) -> None:
