@@ -58,7 +58,10 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         (tmp_path / f"{name}.toml").write_text(SHORT.format(base=base))
     with tempfile.TemporaryDirectory(prefix="ato-", ignore_cleanup_errors=True) as sockets:
         monkeypatch.setenv("XDG_RUNTIME_DIR", sockets)
+        # A background job of a shell ignores Ctrl-C, and so would the nodes.
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
         yield tmp_path
+        signal.signal(signal.SIGINT, before)
 
 
 class Session:
@@ -115,7 +118,7 @@ class Session:
                     process.send_signal(signal.SIGCONT)
                     process.send_signal(signal.SIGINT)
         for node in self.nodes:
-            _out, said = node.communicate(timeout=20)
+            _out, said = node.communicate(timeout=60)
             assert "Traceback" not in said
         return self.process.returncode, errors
 
@@ -196,6 +199,7 @@ def test_a_controller_that_dies_is_named(home: Path) -> None:
     assert "no FORCE_CMD for tick" in session.summary["ended_early"]
 
 
+@pytest.mark.long
 def test_a_plant_that_falls_silent_is_named(home: Path) -> None:
     session = Session(home, "short", "plant", runs=500)
     plant = session.join("plant.py", "--channel", "test", "--runs", "500")
@@ -207,6 +211,7 @@ def test_a_plant_that_falls_silent_is_named(home: Path) -> None:
     assert len(errors.splitlines()) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("everything", "says"),
     [

@@ -96,17 +96,25 @@ def told(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 def test_the_runs_of_a_foreign_plant_are_told(told) -> None:
     nodes = Nodes()
     observer = Observer((PLANT,), cars=0, runs=2, now_s=0.0)
-    for run, ticks, faults in ((1, 70_000, 0), (2, 12, 32)):  # the first wraps the tick
-        start_s = 1000.0 * run
-        observer.take([*nodes.run(run, 0), nodes.control(RUNNING, run)], start_s)
+    for run, ticks, faults in ((1, 30, 0), (2, 12, 32)):
+        observer.take([*nodes.arm(run), nodes.control(RUNNING, run)], 1000.0 * run)
         for tick in range(ticks):
-            observer.take([*nodes.question(tick, run), nodes.answer(tick)], start_s + 1.0)
-        observer.take(nodes.end(run, faults), start_s + 5.0)
-        assert told[run - 1] == {
-            **{"event": "run", "run": run, "ticks": ticks, "seconds": 5.0, "faults": faults}
-        }
+            observer.take([*nodes.question(tick, run), nodes.answer(tick)], 1000.0 * run + 1.0)
+        observer.take(nodes.end(run, faults), 1000.0 * run + 5.0)
+        found = {"run": run, "ticks": ticks, "seconds": 5.0, "faults": faults}
+        assert told[run - 1] == {"event": "run", **found}
     assert told[2:] == [{"event": "done"}]
     assert observer.runs_left == 0
+
+
+def test_the_tick_wraps_after_sixteen_bits(told) -> None:
+    nodes = Nodes()
+    observer = Observer(BOTH, cars=0, runs=1, now_s=0.0)
+    observer.take([*nodes.arm(1), nodes.control(RUNNING, 1)], 1.0)
+    observer.tick = 65_530
+    for tick in range(65_530, 65_545):
+        observer.take([*nodes.question(tick, 1), nodes.answer(tick)], 1.0)
+    assert observer.tick == 65_545
 
 
 def test_our_own_plant_tells_its_runs_itself(told) -> None:
