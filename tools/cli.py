@@ -556,21 +556,48 @@ def _print_bus_report(found: BusReport) -> None:
 
 @app.command()
 def bench(
-    bus: Annotated[str, typer.Option(help="Bus of the HIL figure.")] = "hub:bench",
+    bus: Annotated[
+        list[str] | None,
+        typer.Option(help="Bus to measure, may be repeated; the first is that of the HIL figure."),
+    ] = None,
+    sessions: Annotated[bool, typer.Option(help="Measure SIL and HIL too.")] = True,
 ) -> None:
-    """Measure the rates of SIL and HIL as ratios to a peer in the same run."""
+    """Measure SIL, HIL and buses as ratios to a peer in the same run."""
     from tools import bench as rates
+    from tools import pingpong
 
-    table = Table("what", "ticks/s", "peer", "peer's ticks/s", "ratio", header_style="bold")
-    for figure in rates.measure(bus):
-        table.add_row(
-            figure.what,
-            f"{figure.ticks_per_s:,.0f}",
-            figure.peer,
-            f"{figure.peer_ticks_per_s:,.0f}",
-            f"{figure.ratio:.2f}",
+    buses = bus or ["hub:bench"]
+    with one_line_for_bad_input():
+        if sessions:
+            table = Table("what", "ticks/s", "peer", "peer's ticks/s", "ratio", header_style="bold")
+            for figure in rates.measure(buses[0]):
+                table.add_row(
+                    figure.what,
+                    f"{figure.ticks_per_s:,.0f}",
+                    figure.peer,
+                    f"{figure.peer_ticks_per_s:,.0f}",
+                    f"{figure.ratio:.2f}",
+                )
+            console.print(table)
+        table = Table(
+            *("ping-pong", "round trip p50 µs", "p99 µs", "frames/s"),
+            *("p50 : C", "p99 : C", "frames/s : C"),
+            header_style="bold",
         )
-    console.print(table)
+        for name in buses:
+            figures = pingpong.measure(name)
+            for pair in figures:
+                table.add_row(*_ping_pong(pair, figures[0]))
+        console.print(table)
+
+
+def _ping_pong(figure: Any, peer: Any) -> list[str]:
+    cells = (figure.median_us, figure.slowest_us, figure.frames_per_s)
+    row = [figure.what, *(f"{cell:,.0f}" for cell in cells)]
+    if peer.what.startswith("C"):
+        peers = (peer.median_us, peer.slowest_us, peer.frames_per_s)
+        row += [f"{mine / its:.2f}" for mine, its in zip(cells, peers, strict=True)]
+    return row
 
 
 def _print_rows(rows: list[Row]) -> None:

@@ -9,8 +9,6 @@ import pytest
 
 from can_dbc.bus import open_bus, private_vcan_reason, socketcan_reason
 
-NOBODY = 65534
-
 
 @pytest.fixture(scope="session", autouse=True)
 def _socketcan() -> None:
