@@ -57,6 +57,7 @@ def can_kernel_without_vcan0(monkeypatch):
     monkeypatch.setattr(socket, "AF_CAN", 29, raising=False)  # not there on every system
     monkeypatch.setattr(socket, "CAN_RAW", 1, raising=False)
     monkeypatch.setattr(socket, "socket", CanSocket)
+    monkeypatch.setattr("can_dbc.bus.receive_buffer_bytes", lambda: 64 << 20)
 
 
 @pytest.fixture
@@ -126,6 +127,33 @@ def test_auto_takes_a_private_vcan_without_vcan0(can_kernel_without_vcan0, trial
     choice = choose_bus("auto")
     assert choice.name == "vcan:vcan0"
     assert "there is no network interface 'vcan0' for CAN" in choice.reason
+
+
+SMALL = (
+    "the kernel keeps only 554 frames for a node that lags,"
+    " try: sudo sysctl net.core.rmem_max=8388608"
+)
+
+
+@pytest.fixture
+def small_buffers(monkeypatch):
+    """A kernel that gives this user no more than it did for decades."""
+    monkeypatch.setattr("can_dbc.bus.receive_buffer_bytes", lambda: 425_984)
+
+
+def test_auto_takes_the_hub_where_a_private_vcan_would_lose_frames(
+    can_kernel_without_vcan0, trial, small_buffers
+):
+    trial("")
+    choice = choose_bus("auto")
+    assert choice.name == "hub:vcan0"
+    assert choice.reason == f"there is no network interface 'vcan0' for CAN; {SMALL}"
+
+
+def test_small_buffers_are_said(can_kernel, small_buffers):
+    assert choose_bus("auto").reason == f"vcan0 exists; {SMALL}"
+    for name in ("vcan", "socketcan:vcan0"):
+        assert choose_bus(name).reason == f"asked for; {SMALL}"
 
 
 def test_auto_takes_the_hub_without_any_vcan(can_kernel_without_vcan0, trial):
