@@ -37,11 +37,14 @@ long: $(DEV_READY) ## pass the long tests
 	.venv/bin/python -m pytest -q -m "long and not pil and not uml" $(PYTEST_ARGS)
 
 # The guest is slow: what it runs is compiled here first.
-test-socketcan: $(DEV_READY) ## pass the tests on real SocketCAN, in user-mode Linux
+test-socketcan: $(DEV_READY) ## pass the tests on SocketCAN, in user-mode Linux, and measure it there
 	$(install_guest)
 	.venv/bin/ato-hil run tests/uml/short.toml --bus hub:uml --out runs/test-socketcan
+	.venv/bin/python tests/python_can_tests.py runs/test-socketcan
 	.venv/bin/python tests/uml/guest.py --limit $(GUEST_LIMIT_S) \
 		.venv/bin/python -m pytest -v -p no:cacheprovider -m uml $(PYTEST_ARGS) tests/uml
+	.venv/bin/python tests/uml/guest.py --limit $(GUEST_LIMIT_S) .venv/bin/ato-hil bench \
+		--no-sessions --bus socketcan:vcan0 --bus vcan --bus hub:uml
 
 verify: $(RUN_READY) ## check every promise of the firmware: LAWS="cailc pid", all by default
 	.venv/bin/ato-hil verify $(LAWS)
