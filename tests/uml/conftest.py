@@ -13,6 +13,8 @@ from can_dbc.bus import open_bus, private_vcan_reason, socketcan_reason
 @pytest.fixture(scope="session", autouse=True)
 def _socketcan() -> None:
     reason = socketcan_reason("vcan0") or private_vcan_reason()
+    if os.geteuid() != 0:
+        reason = "they are for root"
     if os.environ.get("ATO_HIL_GUEST"):
         assert not reason
     elif reason:
