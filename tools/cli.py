@@ -302,11 +302,13 @@ def replay(
 ) -> None:
     """Feed a recording to the controller alone; say where its commands first differ (exit 1)."""
     with one_line_for_bad_input():
+        from controller.registry import law_label
         from tools import replay as open_loop
 
         prepared = open_loop.prepare(recording, scenario, law, memory, channel)
         console.print(
-            f"{prepared.loaded.name}, {prepared.calibration.law}: {len(prepared.runs)} runs",
+            f"{prepared.loaded.name}, {law_label(prepared.calibration.law)}:"
+            f" {len(prepared.runs)} runs",
             soft_wrap=True,
         )
         for note in prepared.notes:

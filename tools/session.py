@@ -22,7 +22,7 @@ from can_dbc.bus import choose_bus, open_bus, recv_frames
 from controller import node
 from controller.calibration import Calibration
 from controller.interface import fault_names
-from controller.registry import load_law
+from controller.registry import is_file, load_law
 from plant_sim.scenario import FOLDER, Loaded, load
 from tools import hil, metrics, record, setup, sil
 from tools.frames import Digest
@@ -177,7 +177,7 @@ def _recording(session: Session) -> Iterator[None]:
         scenario=loaded.path,
         packaged=loaded.path.parent == FOLDER,
         scenario_digest=loaded.digest,
-        law=session.law,
+        law=str(Path(session.law).absolute()) if is_file(session.law) else session.law,
         mode=options.mode,
         seed=options.seed,
         memory_file=options.memory,
