@@ -103,7 +103,7 @@ def drive(
     rx_fresh = here.rx["fresh"]
     payload = here.rx["payload"]
     next_progress = time.monotonic()
-    for tick in range(here.loaded.ticks):
+    for tick in range(len(truth)):
         here.sense(here.params, here.limits, here.state, chance, tick, here.tx)
         post(here, bus)
         deadline = time.monotonic() + timeout_s
@@ -138,7 +138,7 @@ def one_run(
     stop: Stop,
 ) -> None:
     """Arms, drives and ends one run; its truth is written even if it is cut short."""
-    truth = np.zeros(here.loaded.ticks, plant.TRUTH)
+    truth = np.zeros(world.run_ticks(here.loaded, here.seed, run), plant.TRUTH)
     file = out / f"truth_{run}.npy"
     agree(here, bus, plant.ARMED, run, arming_s, stop)
     started = time.perf_counter()
@@ -155,7 +155,7 @@ def one_run(
     tell(
         "run",
         run=run,
-        ticks=here.loaded.ticks,
+        ticks=len(truth),
         seconds=seconds,
         file=str(file),
         faults=faults,

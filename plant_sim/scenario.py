@@ -65,6 +65,21 @@ class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     hold_ticks: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 1  # a value stays for so many ticks
 
 
+class RunLength(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Runs of random length: each is cut after a uniform time, new in each run, while the train may
+    still be moving; one that would last beyond the profile ends with it."""
+
+    shortest_s: Positive
+    longest_s: Positive
+    first_s: Positive | None = None  # length of run 1, as a paper may give it
+
+    def __post_init__(self) -> None:
+        if self.longest_s < self.shortest_s:
+            raise ValueError(
+                f"longest_s is {self.longest_s:g}, expected shortest_s or more, {self.shortest_s:g}"
+            )
+
+
 class Metrics(
     msgspec.Struct,
     frozen=True,
@@ -104,6 +119,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     track: Track = Track()
     sensors: Sensors = Sensors()
     disturbance: Disturbance = Disturbance()
+    run_length: RunLength | None = None  # none: every run lasts as long as the profile
     control: Control = Control()
     metrics: Metrics = Metrics()
     tuning: dict[str, str] = {}  # how the gains of each law were found, for who compares them
@@ -122,7 +138,7 @@ class Loaded(msgspec.Struct, frozen=True):
 
     @property
     def ticks(self) -> int:
-        """Control periods of a run."""
+        """Control periods of a whole run."""
         return len(self.profile.x)
 
 
@@ -231,5 +247,5 @@ def _check(path: Path, scenario: Scenario) -> None:
         key = "interpolation" if scenario.track.interpolation != "hold" else "averaged_over_m"
         model = "only train model 'point' takes such a track"
         raise ScenarioError(f"{path}: key track.{key}: {model}")
-    if not scenario.profile.limits:
+    if not scenario.profile.limits and scenario.profile.limit_above_m_s is None:
         raise ScenarioError(f"{path}: key profile.limits: expected at least one limit")

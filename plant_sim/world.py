@@ -17,7 +17,7 @@ from plant_sim import actuator, plant, track
 from plant_sim.scenario import MODELS, Loaded
 
 # Chance: what a random number is drawn for; each gets a stream of its own.
-SPEED_NOISE, DISTURBANCE = 0, 1
+SPEED_NOISE, DISTURBANCE, RUN_LENGTH = 0, 1, 2
 
 
 @dataclass
@@ -89,10 +89,6 @@ def build(loaded: Loaded, seed: int) -> World:
     node["rear_weight"] = 0.5 if scenario.sensors.location == "mean" else 0.0
     node["rear_offset_m"] = train.rear_offset_m
 
-    limits = np.zeros(len(scenario.profile.limits), plant.LIMIT)
-    for row, limit in zip(limits, scenario.profile.limits, strict=True):
-        row["until_tick"] = round(limit.until_s / scenario.period_s)
-        row["speed_m_s"] = limit.speed_m_s
     state = np.zeros(1, plant.state_dtype(model.STATE))
     steps = plant.build(model)
     begin, sense, actuate_and_advance = callable_steps(*steps)
@@ -105,11 +101,42 @@ def build(loaded: Loaded, seed: int) -> World:
         actuate_and_advance=actuate_and_advance,
         params=rows(params),
         state=rows(state),
-        limits=rows(limits),
+        limits=rows(limits_of(loaded)),
         track=rows(track.sections(scenario.track)),
         rx=rows(mailboxes()),
         tx=rows(mailboxes()),
     )
+
+
+def limits_of(loaded: Loaded) -> np.ndarray:
+    """The permitted speed over time, [n] of plant.LIMIT: as the plan states it, or a row for each
+    speed of the reference."""
+    plan, period_s = loaded.scenario.profile, loaded.scenario.period_s
+    if plan.limit_above_m_s is not None:
+        speed_m_s = loaded.profile.speed_m_s
+        last = np.flatnonzero(np.diff(speed_m_s, append=np.inf))
+        limits = np.zeros(len(last), plant.LIMIT)
+        limits["until_tick"] = last
+        limits["speed_m_s"] = speed_m_s[last] + plan.limit_above_m_s
+        return limits
+    limits = np.zeros(len(plan.limits), plant.LIMIT)
+    for row, limit in zip(limits, plan.limits, strict=True):
+        row["until_tick"] = round(limit.until_s / period_s)
+        row["speed_m_s"] = limit.speed_m_s
+    return limits
+
+
+def run_ticks(loaded: Loaded, seed: int, run: int) -> int:
+    """Control periods of a run: all, or as far as its random length goes."""
+    lengths = loaded.scenario.run_length
+    if lengths is None:
+        return loaded.ticks
+    length_s = lengths.shortest_s + (lengths.longest_s - lengths.shortest_s) * float(
+        _uniform(_bits(seed, run, RUN_LENGTH, 1))[0]
+    )
+    if run == 1 and lengths.first_s is not None:
+        length_s = lengths.first_s
+    return min(int(length_s / loaded.scenario.period_s + 0.5) + 1, loaded.ticks)
 
 
 def _bits(seed: int, run: int, stream: int, count: int) -> np.ndarray:
@@ -124,8 +151,11 @@ def _uniform(words: np.ndarray) -> np.ndarray:
 
 
 def chance(loaded: Loaded, seed: int, run: int) -> np.ndarray:
-    """Random numbers of a run, [ticks] of plant.CHANCE; only what the scenario uses is drawn."""
-    ticks = loaded.ticks
+    """Random numbers of a run, [run_ticks] of plant.CHANCE; only what the scenario uses is drawn.
+
+    A tick's number does not depend on when the run ends.
+    """
+    ticks = run_ticks(loaded, seed, run)
     drawn = np.zeros(ticks, plant.CHANCE)
     if loaded.scenario.sensors.speed_noise_m_s > 0:
         # Sum of twelve uniforms: variance 1, no logarithm whose last bit depends on the machine.

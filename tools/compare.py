@@ -44,7 +44,7 @@ def compare(
             for result, _node in sil.run(loaded, calibrations[law], runs=numbers, seed=seed):
                 if result.run not in (1, numbers[-1]):
                     continue
-                command_n = sil.commanded_force_n(result.frames, loaded.ticks)
+                command_n = sil.commanded_force_n(result.frames, len(result.truth))
                 row = metrics.run_metrics(loaded, result.truth, command_n, alpha)
                 rows.append({"law": law, "run": result.run, **row, "faults": result.faults})
                 if result.run == numbers[-1]:

@@ -121,11 +121,8 @@ def run_controller(
     here.tx, here.rx = node.rx, node.tx  # the mailboxes are the bus
     _begin, sense, actuate_and_advance = here.steps
     loop = build_loop(node.tick, sense, actuate_and_advance)
-    frames = world.rows(np.zeros(loaded.ticks * MESSAGE_COUNT, FRAME))
-    chance = world.rows(np.zeros(loaded.ticks, plant.CHANCE))
-    truth = world.rows(np.zeros(loaded.ticks, plant.TRUTH))
 
-    def drive(ticks: int, chance: Any, truth: Any) -> int:
+    def drive(ticks: int, chance: Any, truth: Any, frames: Any) -> int:
         return int(
             loop(
                 ticks,
@@ -145,27 +142,26 @@ def run_controller(
             )
         )
 
-    drive(0, chance, truth)  # compiles, or loads what was compiled before
+    # Compiles, or loads what was compiled before.
+    drive(0, *(world.rows(np.zeros(1, kind)) for kind in (plant.CHANCE, plant.TRUTH, FRAME)))
     for number in runs:
         if progress:
             progress(number, 0)
         _announce(here, node, plant.ARMED, number)
         here.begin(here.params, here.state)
         chance = world.rows(world.chance(loaded, seed, number))
-        truth = np.zeros(loaded.ticks, plant.TRUTH)
+        ticks = len(chance)
+        truth = np.zeros(ticks, plant.TRUTH)
+        # As many rows as there could be; the system gives memory to those that are written.
+        frames = np.empty(ticks * MESSAGE_COUNT, FRAME)
         started = time.perf_counter()
-        count = drive(loaded.ticks, chance, world.rows(truth))
+        count = drive(ticks, chance, world.rows(truth), world.rows(frames))
         seconds = time.perf_counter() - started
         faults = fault_names(int(node.state[0]["core"]["faults"]))
         _announce(here, node, plant.ENDED, number)
         if progress:
-            progress(number, loaded.ticks)
-        yield (
-            RunResult(
-                number, np.asarray(frames[:count]).view(FRAME).copy(), truth, faults, seconds
-            ),
-            node,
-        )
+            progress(number, ticks)
+        yield RunResult(number, frames[:count], truth, faults, seconds), node
 
 
 def _announce(

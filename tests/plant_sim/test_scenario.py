@@ -125,6 +125,14 @@ MISTAKES = [
         'base = "subway"\n[profile]\nlimits = []',
         r"key profile\.limits: expected at least one limit",
     ),
+    (
+        'base = "subway"\n[profile]\nlimit_above_m_s = 0.5',
+        r"key profile: a plan takes only one of limits and limit_above_m_s",
+    ),
+    (
+        'base = "subway"\n[run_length]\nshortest_s = 9.0\nlongest_s = 8.0',
+        r"key run_length: longest_s is 8, expected shortest_s or more, 9",
+    ),
     ('base = "subway"\n[profile]\ndistance_m = 9e3', r"\[profile\]: distance_m = 9000 is out .*"),
 ]
 

@@ -80,7 +80,7 @@ def runs(
     alpha = setup.error_weight(loaded, law)
     return [
         metrics.run_metrics(
-            loaded, result.truth, sil.commanded_force_n(result.frames, loaded.ticks), alpha
+            loaded, result.truth, sil.commanded_force_n(result.frames, len(result.truth)), alpha
         )
         | {"run": result.run, "faults": result.faults}
         for result, _node in sil.run(
