@@ -2,6 +2,10 @@
 measured against. One file a paper."""
 
 from tools.verify.reference import Reference
-from tools.verify.references import cailc, drac
+from tools.verify.references import afilc, cailc, drac
 
-REFERENCES: dict[str, Reference] = {**cailc.REFERENCES, **drac.REFERENCES}
+REFERENCES: dict[str, Reference] = {
+    **cailc.REFERENCES,
+    **drac.REFERENCES,
+    **afilc.REFERENCES,
+}
