@@ -104,6 +104,8 @@ def test_runs_of_different_length_are_no_fault(tmp_path: Path) -> None:
     assert len(set(ticks)) == 3
     assert max(ticks) < 1602
     assert [row["faults"] for row in other["runs"]] == [[], [], []]
+    assert other["controller"] == one["controller"]
+    assert one["controller"]["memory_bytes"] > 0
 
 
 def test_the_summary_has_its_stable_keys(short: Path, tmp_path: Path) -> None:
