@@ -88,6 +88,7 @@ def build(loaded: Loaded, seed: int) -> World:
     node["speed_noise_m_s"] = scenario.sensors.speed_noise_m_s
     node["rear_weight"] = 0.5 if scenario.sensors.location == "mean" else 0.0
     node["rear_offset_m"] = train.rear_offset_m
+    node["recuperation"] = scenario.actuator.recuperation_efficiency
 
     state = np.zeros(1, plant.state_dtype(model.STATE))
     steps = plant.build(model)

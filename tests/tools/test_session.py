@@ -134,6 +134,7 @@ def test_the_summary_has_its_stable_keys(short: Path, tmp_path: Path) -> None:
         *("run", "ticks", "max_delta_m_s", "max_speed_error_m_s", "max_position_error_m"),
         *("rms_speed_error_m_s", "rms_position_error_m", "stop_error_m", "max_acceleration_m_s2"),
         *("rms_command_jerk_m_s3", "overspeed_margin_m_s", "energy_kwh_per_t", "ticks_per_s"),
+        *("braking_kwh_per_t", "recuperated_kwh_per_t", "net_energy_kwh_per_t"),
         "faults",
     } <= set(found["runs"][0])
     assert found["runs"][0]["ticks"] == 2001
