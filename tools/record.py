@@ -56,7 +56,7 @@ class Origin(msgspec.Struct, frozen=True, kw_only=True):
     """The session that a recording comes from, as FILE.json has it."""
 
     schema: int
-    scenario: str  # name of a packaged scenario, or absolute path
+    scenario: str  # name of a packaged scenario, or absolute path; with its case
     scenario_digest: str
     law: str  # name, or absolute path
     mode: str
@@ -113,19 +113,19 @@ def beside(path: Path, ending: str) -> Path:
 def save_origin(
     path: Path,
     *,
-    scenario: Path,
-    packaged: bool,
+    scenario: str,
     scenario_digest: str,
     law: str,
     mode: str,
     seed: int,
     memory_file: Path | None,
 ) -> None:
-    """Write FILE.json, and FILE.memory if `memory_file` exists. Raises RecordError."""
+    """Write FILE.json, and FILE.memory if `memory_file` exists; `scenario` as in Origin. Raises
+    RecordError."""
     copy = beside(path, "memory")
     origin = Origin(
         schema=SCHEMA,
-        scenario=scenario.stem if packaged else str(scenario.absolute()),
+        scenario=scenario,
         scenario_digest=scenario_digest,
         law=law,
         mode=mode,

@@ -174,8 +174,7 @@ def _recording(session: Session) -> Iterator[None]:
         return
     record.save_origin(
         options.record,
-        scenario=loaded.path,
-        packaged=loaded.path.parent == FOLDER,
+        scenario=loaded.name if loaded.path.parent == FOLDER else loaded.source,
         scenario_digest=loaded.digest,
         law=str(Path(session.law).absolute()) if is_file(session.law) else session.law,
         mode=options.mode,
@@ -309,7 +308,7 @@ def _run_hil(session: Session, calibration: Any) -> None:
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, _recording(session):
         kept = Path(scratch)
         events = hil.run(
-            scenario=str(loaded.path),
+            scenario=loaded.source,
             calibration=calibration,
             bus=choice.name,
             runs=session.runs,
