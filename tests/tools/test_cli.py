@@ -121,7 +121,9 @@ def test_a_command_that_differs_ends_the_replay(recorded: Path, tmp_path: Path) 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("paper", "least"), [("cailc", 20), ("drac", 15), ("afilc", 20)])
+@pytest.mark.parametrize(
+    ("paper", "least"), [("cailc", 20), ("drac", 15), ("afilc", 20), ("iplc", 25)]
+)
 def test_the_claims_of_a_paper_come_out_as_found(tmp_path: Path, paper: str, least: int) -> None:
     done = ato_hil("claims", paper, "--json", "claims.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

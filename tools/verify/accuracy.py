@@ -101,8 +101,10 @@ def differences(law: str, reference: Reference, loaded: Loaded) -> tuple[float, 
     module = load_law(law)
     loaded = ideal_sensors(loaded)
     calibration = setup.calibration_for(loaded, law)
-    shadow, truth = _runs(module, reference, loaded, calibration, drive=0)
-    _follows, real = _runs(module, reference, loaded, calibration, drive=1)
+    numbers = setup.run_numbers(law, RUNS)
+    shadow, truths = _runs(module, reference, loaded, calibration, numbers, drive=0)
+    _follows, reals = _runs(module, reference, loaded, calibration, numbers, drive=1)
+    truth, real = np.concatenate(truths), np.concatenate(reals)
     mass = loaded.scenario.train.mass_kg
     return (
         shadow * mass,
@@ -121,10 +123,22 @@ def ideal_sensors(loaded: Loaded) -> Loaded:
     )
 
 
+def reference_runs(law: str, reference: Reference, loaded: Loaded, runs: int) -> list[np.ndarray]:
+    """The plant's truth of each run with the float64 law in the loop."""
+    calibration = setup.calibration_for(loaded, law)
+    numbers = setup.run_numbers(law, runs)
+    return _runs(load_law(law), reference, loaded, calibration, numbers, drive=1)[1]
+
+
 def _runs(
-    module: ModuleType, reference: Reference, loaded: Loaded, calibration: Calibration, drive: int
-) -> tuple[float, np.ndarray]:
-    """Largest difference of the force (m/s^2), and the plant's truth of all runs."""
+    module: ModuleType,
+    reference: Reference,
+    loaded: Loaded,
+    calibration: Calibration,
+    numbers: range,
+    drive: int,
+) -> tuple[float, list[np.ndarray]]:
+    """Largest difference of the force (m/s^2), and the plant's truth of each run."""
     scenario = loaded.scenario
     gains = msgspec.convert(scenario.laws[calibration.law], module.Gains, strict=False)
     vehicle = setup.vehicle(scenario)
@@ -154,7 +168,6 @@ def _runs(
         tx=mailboxes(),
         memory_file=None,
     )
-    numbers = setup.run_numbers(calibration.law, RUNS)
     truth = []
     kept = state["law"]["real"]["memory"].copy()
     for result, _node in sil.run_controller(loaded, controller, runs=numbers, seed=identity.SEED):
@@ -164,4 +177,4 @@ def _runs(
             state["law"]["real"]["memory"] = kept
         else:
             kept = state["law"]["real"]["memory"].copy()
-    return float(state["law"]["difference"][0]), np.concatenate(truth)
+    return float(state["law"]["difference"][0]), truth

@@ -2,10 +2,11 @@
 measured against. One file a paper."""
 
 from tools.verify.reference import Reference
-from tools.verify.references import afilc, cailc, drac
+from tools.verify.references import afilc, cailc, drac, iplc
 
 REFERENCES: dict[str, Reference] = {
     **cailc.REFERENCES,
     **drac.REFERENCES,
     **afilc.REFERENCES,
+    **iplc.REFERENCES,
 }
