@@ -19,7 +19,7 @@ DEV_READY := .venv/dev.ready
 COMPILE := .venv/bin/python -m uv pip compile pyproject.toml --universal --generate-hashes --group build \
 	--no-header --no-annotate --no-emit-index-url --quiet
 
-.PHONY: help hil test long test-socketcan verify golden lint types lock clean
+.PHONY: help hil test long test-socketcan verify golden pareto lint types lock clean
 
 help: ## list the targets
 	sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 23
@@ -51,6 +51,10 @@ verify: $(RUN_READY) ## check every promise of the firmware: LAWS="cailc pid", a
 
 golden: $(RUN_READY) ## write new golden digests (tools/verify/golden.json) and say what changed
 	.venv/bin/ato-hil verify --renew-golden $(LAWS)
+
+pareto: $(RUN_READY) ## draw docs/pareto.png again: energy against error in paper 5
+	.venv/bin/ato-hil sweep gradient-paper:VI --vary law.L=1,5 --vary law.S=0,0.1,0.25,0.5,1,2,4 --out runs/pareto
+	cp runs/pareto/pareto.png docs/pareto.png
 
 lint: $(DEV_READY) ## ruff: lint and format
 	.venv/bin/python -m ruff check .
