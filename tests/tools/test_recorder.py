@@ -99,13 +99,13 @@ class Log:
         self.batches: list[tuple[int, np.ndarray]] = []
         self.calls: list[tuple[Any, ...]] = []
 
-    def frames(self, run: int, frames: np.ndarray) -> None:
+    def frames(self, run: int, frames: np.ndarray, train: int = 0) -> None:
         self.batches.append((run, frames.copy()))
 
-    def text(self, run: int, tick: int, message: str, level: str = "INFO") -> None:
+    def text(self, run: int, tick: int, message: str, level: str = "INFO", train: int = 0) -> None:
         self.calls.append(("text", run, tick, message, level))
 
-    def truth(self, run: int, table: np.ndarray) -> None:
+    def truth(self, run: int, table: np.ndarray, train: int = 0) -> None:
         self.calls.append(("truth", run, table))
 
     def run_summary(self, run: int, row: dict[str, Any]) -> None:

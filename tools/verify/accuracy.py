@@ -145,9 +145,10 @@ def _runs(
     kept = state["law"]["real"]["memory"].copy()
     for result, _node in sil.run_controller(loaded, controller, runs=numbers, seed=identity.SEED):
         truth.append(result.truth)
+        state = controller.state
         # As the firmware does: a run with a fault leaves no trace in what is learned.
         if int(state["core"]["faults"][0]) & FAULTS_THAT_BLOCK_LEARNING:
             state["law"]["real"]["memory"] = kept
         else:
             kept = state["law"]["real"]["memory"].copy()
-    return float(state["law"]["difference"][0]), np.concatenate(truth)
+    return float(controller.state["law"]["difference"][0]), np.concatenate(truth)
