@@ -88,6 +88,8 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     map_share: Share = 0.0  # part of the resistance of the track that the onboard map has
     memory: dict[str, Any] = {}
     guard: dict[str, Any] = {}
+    neighbours: dict[str, Any] = {}  # of a line
+    rebasing: dict[str, Any] | None = None  # of a line; none: its trains keep their timetables
 
 
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
