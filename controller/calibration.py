@@ -18,7 +18,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from controller import distribution, firmware, gradient_map, guard, memory, reference
+from controller import (
+    distribution,
+    firmware,
+    gradient_map,
+    guard,
+    memory,
+    neighbours,
+    rebasing,
+    reference,
+)
 from controller.q import Q_ACCELERATION, Q_FORCE, Q_SPEED
 from controller.quantise import CalibrationError, Vehicle, fixed
 from controller.registry import law_number, load_law
@@ -42,6 +51,18 @@ class GuardSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     age_max_ticks: int = 10
     service_brake_m_s2: float = 0.8
     overspeed_margin_m_s: float = 2 / 3.6  # above the permitted speed, before traction is cut
+
+
+@dataclass(frozen=True)
+class Line:
+    """The place of a train on a line of several, and what it makes of its neighbours."""
+
+    start_m: float  # of its timetable against the common one
+    spacing_m: float  # S0, to each neighbour
+    ahead: bool  # there is a train ahead
+    behind: bool
+    neighbours: neighbours.NeighbourSettings
+    rebasing: rebasing.RebasingSettings | None = None  # none: it stays on its timetable
 
 
 @dataclass(frozen=True)
@@ -69,6 +90,7 @@ def calibrate(
     car_traction_max_n: Sequence[float] = (),
     car_brake_max_n: Sequence[float] = (),
     map_sections: Sequence[tuple[float, float, float]] = (),
+    line: Line | None = None,
     scenario_digest: str,
 ) -> Calibration:
     """PARAMS of the firmware for one law on one scenario. Raises CalibrationError or LawError with
@@ -85,6 +107,8 @@ def calibrate(
     params["gradient_map"] = gradient_map.calibrate(map_sections)
     params["guard"] = _guard(guard_settings)
     params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
+    if line is not None:
+        _line(params, line, vehicle.period_s)
     ticks = int(profile["ticks"].sum()) + 1
     params["memory"] = _memory(words, memory_settings, ticks)
     if car_effectiveness:
@@ -112,6 +136,24 @@ def _guard(settings: GuardSettings) -> np.ndarray:
         "control.guard.overspeed_margin_m_s", settings.overspeed_margin_m_s, Q_SPEED
     )
     return params
+
+
+def _line(params: np.ndarray, line: Line, period_s: float) -> None:
+    """PARAMS of what a train makes of its neighbours, in place."""
+    params["neighbours"] = neighbours.calibrate(
+        line.neighbours,
+        period_s=period_s,
+        start_m=line.start_m,
+        ahead=line.ahead,
+        behind=line.behind,
+    )
+    if line.rebasing is not None:
+        try:
+            params["rebasing"] = rebasing.calibrate(
+                line.rebasing, period_s=period_s, spacing_m=line.spacing_m
+            )
+        except CalibrationError as error:
+            raise CalibrationError(f"control.rebasing: {error}") from None
 
 
 def _whole(key: str, value: int, low: int, high: int) -> int:
