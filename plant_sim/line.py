@@ -59,7 +59,7 @@ class Fault(
     from_s: Seconds
     to_s: Seconds = float("inf")
     traction_share: Annotated[float, msgspec.Meta(ge=0, lt=1)] | None = None  # of the largest force
-    brake_m_s2: Annotated[float, msgspec.Meta(gt=0, le=10)] | None = None  # whatever is commanded
+    brake_m_s2: Annotated[float, msgspec.Meta(gt=0, le=10)] | None = None  # deceleration
     emergency: bool = False  # ATP says so: supervision is emergency_brake while it brakes
 
     def __post_init__(self) -> None:

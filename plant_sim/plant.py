@@ -80,13 +80,14 @@ NODE_PARAMS = np.dtype(
         ("speed_noise_m_s", np.float64),  # standard deviation
         ("rear_weight", np.float64),  # 0: sensor at the front, 0.5: mean of front and rear
         ("rear_offset_m", np.float64),  # distance of front and rear at rest
+        ("mass_kg", np.float64),
         ("holding_force_n", np.float64),  # of the actuators when a run begins
         ("weak_from", np.int64),  # first tick of lost traction
         ("weak_to", np.int64),  # first tick after it
         ("weak_force_n", np.float64),  # largest traction that is left
         ("brake_from", np.int64),  # the same of a brake that nobody commanded
         ("brake_to", np.int64),
-        ("brake_force_n", np.float64),
+        ("brake_m_s2", np.float64),  # deceleration that it holds
         ("brake_supervision", np.int64),  # what ATP says meanwhile
     ],
     align=True,
@@ -222,13 +223,16 @@ def read_commands(params: Any, node: Any, rx: Any) -> None:
 
 
 @step
-def fail(params: Any, node: Any) -> None:
+def fail(params: Any, node: Any, train: Any) -> None:
     """What the scenario's faults make of the command: less traction, or a brake."""
     tick = int64(node.tick)
     if tick >= params.weak_from and tick < params.weak_to:
         node.command_n[0] = min(node.command_n[0], params.weak_force_n)
     if tick >= params.brake_from and tick < params.brake_to:
-        node.command_n[0] = -params.brake_force_n
+        force = -params.mass_kg * params.brake_m_s2
+        if train.speed_m_s > 0.0:  # the train's resistance brakes as well
+            force += train.force_n - params.mass_kg * train.acceleration_m_s2
+        node.command_n[0] = force
 
 
 @step
@@ -326,7 +330,7 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         truth.traction_j = train.traction_j
         read_commands(params.node, node, rx)
         radio.read(node, state.radio, rx)
-        fail(params.node, node)
+        fail(params.node, node, train)
         command_train(params, state)
         actuator.shift(state.actuator)
         advance_train(

@@ -1,9 +1,9 @@
 """The radio between the trains of a line: what a train sends arrives late, in order, not always.
 
 Every period a train sends its measured position and speed, as they are on its bus in that tick,
-with what its controller said last (ATO_RADIO). `delay` ticks later the packet is on the buses of both
-neighbours as NEIGHBOUR_*, unless it is lost. Where nothing new arrives, the last packet is repeated
-every REPEAT_TICKS with its grown age.
+with what its controller said last (ATO_RADIO). `delay` ticks later the packet is on the buses of
+both neighbours as NEIGHBOUR_*, unless it is lost. Where nothing new arrives, the last packet is
+repeated every REPEAT_TICKS with its grown age.
 """
 
 from __future__ import annotations

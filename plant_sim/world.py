@@ -92,6 +92,7 @@ def _params(loaded: Loaded, model: Any) -> np.ndarray:
         scenario.actuator, train.mass_kg, scenario.period_s, scenario.period_s / train.substeps
     )
     node = params["node"]
+    node["mass_kg"] = train.mass_kg
     cars = len(train.effectiveness)
     node["cars"] = cars if scenario.control.distribute else 0
     node["effectiveness"][0, :cars] = train.effectiveness
@@ -121,12 +122,11 @@ def _fail(node: np.ndarray, fault: Fault, scenario: Scenario) -> None:
     kind = "brake" if fault.traction_share is None else "weak"
     node[f"{kind}_from"] = round(fault.from_s / scenario.period_s)
     node[f"{kind}_to"] = round(min(fault.to_s / scenario.period_s, NEVER))
-    mass_kg = scenario.train.mass_kg
     if fault.traction_share is not None:
-        largest_n = scenario.actuator.force_max_m_s2 * mass_kg
+        largest_n = scenario.actuator.force_max_m_s2 * scenario.train.mass_kg
         node["weak_force_n"] = fault.traction_share * largest_n
     else:
-        node["brake_force_n"] = (fault.brake_m_s2 or 0.0) * mass_kg
+        node["brake_m_s2"] = fault.brake_m_s2
         node["brake_supervision"] = plant.EMERGENCY_BRAKE if fault.emergency else 0
 
 

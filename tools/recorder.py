@@ -9,8 +9,8 @@ It says on stdout, in JSON lines:
 
     {"event": "ready"}                                     it listens
     {"event": "run", "run": 1, "ticks": …, "frames": …,    a run has ended on every bus; lost frames
-     "lost": {…}, "digest": "…", "digests": ["…"],         by message, digest of all runs so far, and
-     "complete": true}                                     that of each train
+     "lost": {…}, "digest": "…", "digests": ["…"],         by message, digest of all runs so far,
+     "complete": true}                                     and that of each train
     {"event": "error", "message": "…"}                     it ends early
 
 and takes on stdin:
