@@ -2,6 +2,6 @@
 measured against. One file a paper."""
 
 from tools.verify.reference import Reference
-from tools.verify.references import cailc, drac
+from tools.verify.references import cailc, drac, mtcc
 
-REFERENCES: dict[str, Reference] = {**cailc.REFERENCES, **drac.REFERENCES}
+REFERENCES: dict[str, Reference] = {**cailc.REFERENCES, **drac.REFERENCES, **mtcc.REFERENCES}
