@@ -29,12 +29,7 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
         return calibrate(
             law=law,
             gains=scenario.laws[law],
-            vehicle=Vehicle(
-                scenario.train.mass_kg * (1.0 + scenario.control.mass_error),
-                scenario.period_s,
-                scenario.actuator.force_max_m_s2,
-                _characteristic(scenario),
-            ),
+            vehicle=vehicle(scenario),
             profile=loaded.segments,
             preview_ticks=scenario.control.preview_ticks,
             memory_settings=_settings("control.memory", scenario.control.memory, MemorySettings),
@@ -70,6 +65,16 @@ def _line(loaded: Loaded) -> Line | None:
         rebasing=_settings("control.rebasing", control.rebasing, RebasingSettings)
         if control.rebasing is not None
         else None,
+    )
+
+
+def vehicle(scenario: Scenario) -> Vehicle:
+    """What the controller of a scenario knows of its train."""
+    return Vehicle(
+        scenario.train.mass_kg * (1.0 + scenario.control.mass_error),
+        scenario.period_s,
+        scenario.actuator.force_max_m_s2,
+        _characteristic(scenario),
     )
 
 

@@ -259,7 +259,6 @@ def bounds(params: Any, inputs: Any, e: Any, outputs: Any) -> Any:
 @step
 def begin_common(state: Any) -> None:
     """A run starts."""
-    state.command = 0
     state.frozen = 0
 
 
@@ -268,7 +267,8 @@ def limited(params: Any, state: Any, inputs: Any, wanted: Any) -> Any:
     """1 if the command that `wanted` (m/s^2, Q27) becomes must not teach; writes state.command."""
     most = int64(params.force_max)
     within = clamp(wanted, -most, most)
-    last = int64(state.command)
+    # The train is held at the start with what its law asks for first.
+    last = within if int64(inputs.tick) == 0 else int64(state.command)
     slope = int64(params.slope_max)
     command = clamp(within, last - slope, last + slope)
     state.command = command

@@ -7,22 +7,12 @@ import sys
 import pytest
 
 from controller.registry import law_names
-from tools.verify import FAILED, PASSED, accuracy, cost, identity, instructions, table
+from tools.verify import PASSED, accuracy, cost, identity, instructions, table
 
 pytestmark = pytest.mark.long
 
 
-# Their accuracy is measured in test_acceptance_drac.py; `verify` has no float64 form of them yet
-# and says so as a failure.
-WITHOUT_REFERENCE = {"drac", "drac-exact", "drac-robust", "pid-feedforward"}
-
-
-@pytest.mark.parametrize("law", sorted(WITHOUT_REFERENCE))
-def test_a_law_without_a_float64_form_does_not_pass(law):
-    assert [row.state for row in accuracy.check(law)] == [FAILED]
-
-
-@pytest.mark.parametrize("law", sorted(set(law_names()) - WITHOUT_REFERENCE))
+@pytest.mark.parametrize("law", law_names())
 def test_fixed_point_is_near_float64(law):
     rows = list(accuracy.check(law))
     assert [row.state for row in rows] == [PASSED] * 3, rows

@@ -1,73 +1,27 @@
-"""The laws once more in float64, straight from the papers' equations in SI: what the fixed-point
-laws are measured against.
-
-A reference has REAL_PARAMS and REAL_STATE (float64 records), `params(gains, vehicle)`, and a step
-`force(params, state, inputs)` that returns u / M in m/s^2. Helpers take numbers, no records: numba
-would compile one for the first record type and use it for others that begin alike. Nothing is
-scaled, rounded or saturated but what the equations themselves limit. What a law learns stands in
-`state.memory`, [ticks, words], in SI.
-"""
+"""The laws of paper 1 in float64: `own` of each step is two variables of the law."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from can_dbc.step import step
 from controller.quantise import Vehicle
+from tools.verify.reference import Reference, limited, q15, q24, q27, recorded
 
 CHI_MAX = 128.0  # m/s, where the fixed-point barrier saturates
 E_MAX = 16.0  # m
 V_MAX = 32.0  # m/s
 
+OWN = np.dtype((np.float64, (2,)))
 
-@dataclass(frozen=True)
-class Reference:
-    """A law in float64, and how near the fixed-point law must stay."""
-
-    words: int  # learned
-    names: tuple[str, ...]  # parameters, float64
-    params: Callable[[Any, Vehicle], tuple[float, ...]]  # their values
-    initial: Callable[[Any, Vehicle], tuple[float, ...]]  # of the learned words
-    force: Any  # the step
-    # Bounds: largest difference on the same inputs, N; in closed loop over the same runs, m and
-    # m/s.
-    force_n: float
-    position_m: float
-    speed_m_s: float
-
-
-def state_dtype(words: int, ticks: int) -> np.dtype:
-    """REAL_STATE: four variables of the law's own and its memory."""
-    return np.dtype([("own", np.float64, (4,)), ("memory", np.float64, (ticks, max(words, 1)))])
-
-
-def _nothing(_gains: Any, _vehicle: Vehicle) -> tuple[float, ...]:
-    return ()
-
-
-@step
-def _q15(value: Any) -> Any:
-    return value * 2.0**-15
-
-
-@step
-def _q24(value: Any) -> Any:
-    return value * 2.0**-24
-
-
-@step
-def _q27(value: Any) -> Any:
-    return value * 2.0**-27
-
-
-@step
-def _limited(value: Any, low: Any, high: Any) -> Any:
-    return min(max(value, low), high)
+PID = ("gp", "gI", "gD", "force_max")
+PDILC = (*PID, "kp", "kD")
+ADAPTIVE = ("alpha", "g0", "g1", "g2", "eps1", "force_max")
+AILC = ("alpha", "beta", "gamma_1", "gamma_2", "gamma_3", "force_max")
+CAILC = (*AILC, "nu_b", "r_max", "min_1", "min_2", "min_3", "max_1", "max_2", "max_3")
 
 
 # (60)
@@ -88,11 +42,11 @@ def _pid(gp: Any, gI: Any, gD: Any, force_max: Any, own: Any, inputs: Any) -> An
     if inputs.tick == 0:
         own[0] = 0.0
         own[1] = 0.0
-    eps = _q24(inputs.reference_speed) - _q24(inputs.speed)
+    eps = q24(inputs.reference_speed) - q24(inputs.speed)
     own[0] += eps
     change = eps - own[1]
     own[1] = eps
-    return _limited(gp * eps + gI * own[0] + gD * change, -force_max, force_max)
+    return limited(gp * eps + gI * own[0] + gD * change, -force_max, force_max)
 
 
 @step
@@ -115,11 +69,11 @@ def _pdilc_force(p: Any, state: Any, inputs: Any) -> Any:
     else:
         if inputs.tick == 0:
             state.own[1] = 0.0
-        eps = _q24(inputs.reference_speed) - _q24(inputs.speed)
+        eps = q24(inputs.reference_speed) - q24(inputs.speed)
         change = eps - state.own[1]
         state.own[1] = eps
         force = state.memory[inputs.tick, 0] + p.kp * eps + p.kD * change
-        force = _limited(force, -p.force_max, p.force_max)
+        force = limited(force, -p.force_max, p.force_max)
     state.memory[inputs.tick, 0] = force
     return force
 
@@ -142,9 +96,9 @@ def _adaptive_params(gains: Any, vehicle: Vehicle) -> tuple[float, ...]:
 @step
 def _errors(alpha: Any, inputs: Any) -> Any:
     """ed and delta = alpha e + ed."""
-    e = _q15(inputs.position) - _q15(inputs.reference_position)
-    ed = _q24(inputs.speed) - _q24(inputs.reference_speed)
-    return ed, alpha * _limited(e, -E_MAX, E_MAX) + ed
+    e = q15(inputs.position) - q15(inputs.reference_position)
+    ed = q24(inputs.speed) - q24(inputs.reference_speed)
+    return ed, alpha * limited(e, -E_MAX, E_MAX) + ed
 
 
 @step
@@ -152,7 +106,7 @@ def _adaptive_force(p: Any, state: Any, inputs: Any) -> Any:
     if inputs.tick == 0:
         state.own[0] = 0.0
     _ed, delta = _errors(p.alpha, inputs)
-    v = min(abs(_q24(inputs.speed)), V_MAX)
+    v = min(abs(q24(inputs.speed)), V_MAX)
     lam = 1.0 + v + v * v
     q = lam * abs(delta)
     rho = q / (q + p.eps1)
@@ -161,7 +115,7 @@ def _adaptive_force(p: Any, state: Any, inputs: Any) -> Any:
     if delta < 0.0:
         bound = -bound
     state.own[0] = max(h - p.g1 * h + p.g2 * q * rho, 0.0)
-    return _limited(-p.g0 * delta - bound, -p.force_max, p.force_max)
+    return limited(-p.g0 * delta - bound, -p.force_max, p.force_max)
 
 
 # (12), (13), (30)-(35)
@@ -186,14 +140,14 @@ def _xi_initial(gains: Any, vehicle: Vehicle) -> tuple[float, ...]:
 def _xi_force(xi: Any, v: Any, damping: Any, force_max: Any, inputs: Any) -> Any:
     """(31) over M."""
     resistance = xi[0] + xi[1] * v + xi[2] * v * v
-    wanted = resistance + _q27(inputs.ahead_acceleration) - damping
-    return _limited(wanted, -force_max, force_max)
+    wanted = resistance + q27(inputs.ahead_acceleration) - damping
+    return limited(wanted, -force_max, force_max)
 
 
 @step
 def _ailc_force(p: Any, state: Any, inputs: Any) -> Any:
     ed, delta = _errors(p.alpha, inputs)
-    v = _limited(_q24(inputs.speed), -V_MAX, V_MAX)
+    v = limited(q24(inputs.speed), -V_MAX, V_MAX)
     xi = state.memory[inputs.tick]
     xi[0] -= p.gamma_1 * delta
     xi[1] -= p.gamma_2 * v * delta
@@ -204,33 +158,30 @@ def _ailc_force(p: Any, state: Any, inputs: Any) -> Any:
 @step
 def _cailc_force(p: Any, state: Any, inputs: Any) -> Any:
     ed, delta = _errors(p.alpha, inputs)
-    v = _limited(_q24(inputs.speed), -V_MAX, V_MAX)
+    v = limited(q24(inputs.speed), -V_MAX, V_MAX)
     r = min(delta * delta / (p.nu_b * p.nu_b), p.r_max)
     cosine = math.cos(0.5 * math.pi * r)
-    chi = _limited(delta / (cosine * cosine), -CHI_MAX, CHI_MAX)
+    chi = limited(delta / (cosine * cosine), -CHI_MAX, CHI_MAX)
     xi = state.memory[inputs.tick]
-    xi[0] = _limited(xi[0] - p.gamma_1 * chi, p.min_1, p.max_1)
-    xi[1] = _limited(xi[1] - p.gamma_2 * v * chi, p.min_2, p.max_2)
-    xi[2] = _limited(xi[2] - p.gamma_3 * v * v * chi, p.min_3, p.max_3)
+    xi[0] = limited(xi[0] - p.gamma_1 * chi, p.min_1, p.max_1)
+    xi[1] = limited(xi[1] - p.gamma_2 * v * chi, p.min_2, p.max_2)
+    xi[2] = limited(xi[2] - p.gamma_3 * v * v * chi, p.min_3, p.max_3)
     return _xi_force(xi, v, p.alpha * ed + p.beta * delta, p.force_max, inputs)
 
-
-_PID = ("gp", "gI", "gD", "force_max")
-_AILC = ("alpha", "beta", "gamma_1", "gamma_2", "gamma_3", "force_max")
-_CAILC = (*_AILC, "nu_b", "r_max", "min_1", "min_2", "min_3", "max_1", "max_2", "max_3")
-_ADAPTIVE = ("alpha", "g0", "g1", "g2", "eps1", "force_max")
 
 # Bounds: 20 N and 5 um are those of the acceptance of paper 1, 50 um/s goes with them. The
 # adaptive law's loop gain is near the limit where it chatters: a difference of one bit moves its
 # speed for a tick, so its closed loop has wider bounds.
 REFERENCES: dict[str, Reference] = {
-    "pid": Reference(0, _PID, _pid_params, _nothing, _pid_force, 20.0, 5e-6, 5e-5),
-    "pdilc": Reference(
-        1, (*_PID, "kp", "kD"), _pdilc_params, _nothing, _pdilc_force, 20.0, 5e-6, 5e-5
-    ),
+    "pid": Reference(recorded(PID, _pid_params), OWN, _pid_force, 20.0, 5e-6, 5e-5),
+    "pdilc": Reference(recorded(PDILC, _pdilc_params), OWN, _pdilc_force, 20.0, 5e-6, 5e-5, 1),
     "adaptive": Reference(
-        0, _ADAPTIVE, _adaptive_params, _nothing, _adaptive_force, 20.0, 2e-5, 2e-3
+        recorded(ADAPTIVE, _adaptive_params), OWN, _adaptive_force, 20.0, 2e-5, 2e-3
     ),
-    "ailc": Reference(3, _AILC, _ailc_params, _xi_initial, _ailc_force, 20.0, 5e-6, 5e-5),
-    "cailc": Reference(3, _CAILC, _cailc_params, _xi_initial, _cailc_force, 20.0, 5e-6, 5e-5),
+    "ailc": Reference(
+        recorded(AILC, _ailc_params), OWN, _ailc_force, 20.0, 5e-6, 5e-5, 3, _xi_initial
+    ),
+    "cailc": Reference(
+        recorded(CAILC, _cailc_params), OWN, _cailc_force, 20.0, 5e-6, 5e-5, 3, _xi_initial
+    ),
 }
