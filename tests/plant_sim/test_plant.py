@@ -266,17 +266,17 @@ def test_truth_shows_the_couplers():
 @pytest.mark.parametrize("run_state", [plant.ARMED, plant.ENDED])
 def test_an_announcement_is_confirmed_only_by_its_own_state_and_run(run_state):
     rig = Rig()
-    plant.announce(rig.node, run_state, 12, rig.here.tx)
+    plant.announce(rig.node, run_state, 12, rig.here.tx[0])
     assert rig.sent(RUN_CTRL, "RunState") == run_state
     assert rig.sent(RUN_CTRL, "Iteration") == 12
     answers = [(run_state, 11), (plant.RUNNING, 12), (run_state, 12)]
     confirmed = []
     for state, iteration in answers:
         rig.receive(ATO_STATUS, RunState=state, Iteration=iteration)
-        confirmed.append(plant.confirmed(rig.node, rig.here.rx))
+        confirmed.append(plant.confirmed(rig.node, rig.here.rx[0]))
     assert confirmed == [0, 0, 1]
     rig.here.rx["fresh"][:] = 0
-    assert plant.confirmed(rig.node, rig.here.rx) == 0
+    assert plant.confirmed(rig.node, rig.here.rx[0]) == 0
 
 
 # The same bits everywhere.
