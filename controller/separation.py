@@ -65,7 +65,7 @@ def push(params: Any, distance: Any) -> Any:
     under_outer = max(int64(params.outer) - square, int64(params.least))
     inner = (int64(params.range) << 24) // max(over_inner, int64(1))  # Q24, below 2^31
     outer = (int64(params.range) << 24) // max(under_outer, int64(1))
-    slope = ((inner * inner) >> 30) - ((outer * outer) >> 30)  # Q18
+    slope = round_shift(inner * inner, 30) - round_shift(outer * outer, 30)  # Q18
     strength = sat32(round_shift(distance * int64(params.gain), 24))  # G D, m/s^2, Q27
     share = round_shift(strength * slope, 18)
     return clamp(share, -int64(params.most), int64(params.most))
