@@ -22,7 +22,7 @@ from can_dbc.codec import (
     put,
 )
 from plant_sim import plant, radio, world
-from plant_sim.scenario import load
+from plant_sim.scenario import load, members
 
 TRAINS = 3
 PLACE = (NEIGHBOUR_AHEAD_POSITION, NEIGHBOUR_BEHIND_POSITION)
@@ -264,7 +264,7 @@ def test_a_single_train_has_no_radio():
 def drawn(tmp_path: Path, text: str, train: int = 1, run: int = 1):
     path = tmp_path / "radio.toml"
     path.write_text(f'base = "line"\n[line.radio]\n{text}')
-    loaded = world.members(load.__wrapped__(str(path)))[train]
+    loaded = members(load.__wrapped__(str(path)))[train]
     return world.chance(loaded, 1, run)
 
 
