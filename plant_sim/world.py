@@ -102,7 +102,7 @@ def _params(loaded: Loaded, model: Any) -> np.ndarray:
     node["rear_weight"] = 0.5 if scenario.sensors.location == "mean" else 0.0
     node["rear_offset_m"] = train.rear_offset_m
     if isinstance(train, point.Train) and train.held_at_start:
-        sections = track.sections(scenario.track)
+        sections = rows(track.sections(scenario.track))
         here = track.section_at(sections, train.start_m, 0)
         grade = GRAVITY_M_S2 * N_PER_KN * track.resistance_at(sections, here, train.start_m)
         node["holding_force_n"] = train.mass_kg * (train.resistance.constant[0] + grade)

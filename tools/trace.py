@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from can_dbc.codec import (
+    ATO_RADIO,
     ATO_STATUS,
     ATO_TRACKING,
     ATP_LIMIT,
@@ -149,6 +150,8 @@ PLOTS = (
             Line(NEIGHBOUR_BEHIND_MOTION, "OffsetSpeed", "behind, re-based", PINK),
         ),
     ),
+    Plot("rebased_position", "m", (Line(ATO_RADIO, "Offset", "own timetable", BLUE),)),
+    Plot("rebased_speed", "m/s", (Line(ATO_RADIO, "OffsetSpeed", "own timetable", BLUE),)),
 )
 
 CAR_FORCES = (CAR_FORCE_1, CAR_FORCE_2, CAR_FORCE_3, CAR_FORCE_4)  # two cars each
@@ -178,6 +181,9 @@ LANES = (
     Lane("behind_valid", NEIGHBOUR_BEHIND_POSITION, "Valid"),
     Lane("behind_emergency_brake", NEIGHBOUR_BEHIND_POSITION, "EmergencyBrake"),
     Lane("behind_rebased", NEIGHBOUR_BEHIND_POSITION, "Rebased"),
+    Lane("rebased", ATO_RADIO, "Rebased"),
+    Lane("emergency_brake_to_rear", ATO_RADIO, "EmergencyBrakeToRear"),
+    Lane("emergency_brake_to_front", ATO_RADIO, "EmergencyBrakeToFront"),
 )
 OVERVIEW_LANES = ("mode", "supervision", "guard", "faults", "sensor")
 
@@ -650,6 +656,8 @@ def _blueprint(
         plot("Position of the neighbours [m]", f"bus/neighbour_position/{current}"),
         plot("Speed of the neighbours [m/s]", f"bus/neighbour_speed/{current}"),
         plot("Age of the radio data [s]", f"bus/neighbour_age/{current}"),
+        plot("Timetable against the common one [m]", f"bus/rebased_position/{current}"),
+        plot("Speed of the timetable [m/s]", f"bus/rebased_speed/{current}"),
     )
     signals = rrb.Grid(
         plot("Position [m]", f"bus/position/{current}", "reference/position_m"),

@@ -49,7 +49,7 @@ def short(
         base=base,
         trains=trains,
         duration_s=duration_s,
-        distance_m=0.04 * duration_s**2,
+        distance_m=0.03 * duration_s**2,
         max_speed_m_s=0.15 * duration_s,
         end_s=duration_s - 0.5,
         more=more,
@@ -190,8 +190,8 @@ def test_separation_barrier_distance_and_string_amplification() -> None:
     assert row["min_separation_m"] == pytest.approx(spacing - 0.19)
     amplified = [train["string_amplification"] for train in of_trains]
     assert amplified[0] is None
-    assert amplified[1:] == pytest.approx([0.5, 4.0])
-    assert row["string_amplification"] == pytest.approx(4.0)
+    assert amplified[1:] == pytest.approx([0.5, 4.0], rel=1e-4)
+    assert row["string_amplification"] == amplified[2]
     distances = [train["min_barrier_distance_m"] for train in of_trains]
     assert distances == pytest.approx([0.2 - 0.125, 0.2 - 0.0625, -0.05])
     columns = line_columns(trains, "mtcc", frames, truths)
