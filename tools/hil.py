@@ -1,5 +1,5 @@
-"""HIL: recorder, controller and plant as processes of their own on one bus; this process starts,
-watches and ends them.
+"""HIL: recorder, controllers and plant as processes of their own, on a bus for each train; this
+process starts, watches and ends them.
 
 A process that dies, a node that falls silent or Ctrl-C ends the run within two seconds, names the
 cause, keeps the traces so far, and leaves no process and no socket behind.
@@ -51,7 +51,7 @@ class Node:
 
 
 class Bench:
-    """The three nodes of one run. Use as a context manager: leaving it ends every node."""
+    """The nodes of one run. Use as a context manager: leaving it ends every node."""
 
     def __init__(self, out: Path) -> None:
         self.out = out
@@ -117,33 +117,36 @@ class Bench:
                 raise RunError(f"{', '.join(late)} not ready within {READY_TIMEOUT_S:g} s")
 
     def end(self) -> None:
-        """Ends plant and controller, then the recorder, which writes what it has; kills what does
+        """Ends plant and controllers, then the recorder, which writes what it has; kills what does
         not end."""
-        for name in ("plant", "controller"):
-            self._end(name, STOP_TIMEOUT_S)
+        driving = [node for node in self.nodes.values() if node.name != "recorder"]
+        for node in driving:
+            if node.process.poll() is None:
+                node.process.terminate()
+        deadline = time.monotonic() + STOP_TIMEOUT_S
+        for node in driving:
+            _wait(node, max(deadline - time.monotonic(), 0.0))
         recorder = self.nodes.get("recorder")
-        if recorder is not None and recorder.process.poll() is None:
-            recorder.command(command="stop")
-        self._end("recorder", 30.0, terminate=False)
+        if recorder is not None:
+            if recorder.process.poll() is None:
+                recorder.command(command="stop")
+            _wait(recorder, 30.0)
         for node in self.nodes.values():
             if node.log.exists() and node.log.stat().st_size == 0:
                 node.log.unlink()
 
-    def _end(self, name: str, timeout_s: float, terminate: bool = True) -> None:
-        node = self.nodes.get(name)
-        if node is None:
-            return
-        if terminate and node.process.poll() is None:
-            node.process.terminate()
-        try:
-            node.process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            node.process.kill()
-            node.process.wait()
-        for stream in (node.process.stdin, node.process.stdout):
-            if stream is not None:
-                with suppress(BrokenPipeError):
-                    stream.close()
+
+def _wait(node: Node, timeout_s: float) -> None:
+    """Until the node has ended; killed after `timeout_s`."""
+    try:
+        node.process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        node.process.kill()
+        node.process.wait()
+    for stream in (node.process.stdin, node.process.stdout):
+        if stream is not None:
+            with suppress(BrokenPipeError):
+                stream.close()
 
 
 def _exit_text(code: int) -> str:
@@ -155,9 +158,9 @@ def _last_line(node: Node) -> str:
     return f": {lines[-1]}" if lines else ""
 
 
-def flash(calibration: Calibration, folder: Path) -> Path:
-    """The calibration as a file for the controller process."""
-    path = folder / "calibration.npz"
+def flash(calibration: Calibration, folder: Path, name: str) -> Path:
+    """The calibration as a file for the controller process called `name`."""
+    path = folder / f"{name}.npz"
     calibrations.save(calibration, path)
     return path
 
@@ -165,8 +168,8 @@ def flash(calibration: Calibration, folder: Path) -> Path:
 def run(
     *,
     scenario: str,
-    calibration: Calibration,
-    bus: str,
+    controllers: list[Calibration],
+    buses: list[str],
     runs: range,
     seed: int,
     out: Path,
@@ -174,29 +177,34 @@ def run(
     recorder_arguments: list[str],
 ) -> Generator[tuple[Node, dict[str, Any], Bench], None, None]:
     """Events of the nodes until all runs are done and recorded; see the `tell` calls of the
-    processes.
+    processes. `controllers` and `buses` have an entry for each train.
 
     Raises RunError with one line if a node dies, falls silent or reports an error.
     """
+    on_buses = [argument for bus in buses for argument in ("--bus", bus)]
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, Bench(out) as bench:
-        calibration_file = flash(calibration, Path(scratch))
-        recorder = bench.start("recorder", ["tools.recorder", "--bus", bus, *recorder_arguments])
-        controller_arguments = ["--calibration", str(calibration_file), "--bus", bus]
-        if memory_file is not None:
-            controller_arguments += ["--memory", str(memory_file)]
-        bench.start("controller", ["controller.process", *controller_arguments])
-        plant = bench.start(
-            "plant",
-            [
-                "plant_sim.process",
-                *("--scenario", scenario),
-                *("--bus", bus),
-                *("--seed", str(seed)),
-                *("--first-run", str(runs[0])),
-                *("--last-run", str(runs[-1])),
-                *("--out", scratch),
-            ],
-        )
+        recorder = bench.start("recorder", ["tools.recorder", *on_buses, *recorder_arguments])
+        for train, (calibration, bus) in enumerate(zip(controllers, buses, strict=True), start=1):
+            name = "controller" if len(buses) == 1 else f"controller-{train}"
+            file = flash(calibration, Path(scratch), name)
+            arguments = ["--calibration", str(file), "--bus", bus]
+            if memory_file is not None:
+                arguments += ["--memory", str(memory_file)]
+            bench.start(name, ["controller.process", *arguments])
+            if train == 1:
+                plant = bench.start(
+                    "plant",
+                    [
+                        "plant_sim.process",
+                        *("--scenario", scenario),
+                        *on_buses,
+                        *("--seed", str(seed)),
+                        *("--first-run", str(runs[0])),
+                        *("--last-run", str(runs[-1])),
+                        *("--out", scratch),
+                    ],
+                )
+                bench.wait_ready()  # what the first controller compiles, the others load
         bench.wait_ready()
         plant.command(command="start")
         while "done" not in plant.said or recorder.said.get("run", {}).get("run") != runs[-1]:

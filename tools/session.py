@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,17 +19,19 @@ import numpy as np
 
 from can_dbc.bus import choose_bus, open_bus, recv_frames
 from controller import node
+from controller.calibration import Calibration
 from controller.interface import fault_names
 from controller.registry import load_law
-from plant_sim.scenario import Loaded, load
-from tools import hil, metrics, setup, sil
-from tools.frames import Digest
+from plant_sim.scenario import Loaded, load, members
+from tools import hil, line, setup, sil
+from tools.frames import LineDigest
 from tools.hil import RunError
 from tools.lyapunov import has_lyapunov, lyapunov
-from tools.recorder import save_settings
+from tools.recorder import frames_folder, save_settings
 
 SCHEMA = 1
 RUNS_MAX = 4095  # Iteration has 12 bits
+BUSY_S = 0.3  # how long to listen for other traffic, on all buses together
 
 
 class SessionError(ValueError):
@@ -72,6 +75,7 @@ class Session:
 
     options: Options
     loaded: Loaded
+    members: list[Loaded]  # the scenario of each train
     law: str
     runs: range
     listener: Listener
@@ -88,14 +92,17 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     loaded = load(options.scenario)
     law = options.law or loaded.scenario.law
     load_law(law)
-    calibration = setup.calibration_for(loaded, law)
-    learned = -1 if options.memory is None else node.last_iteration(calibration, options.memory)
+    trains = members(loaded)
+    calibrations = [setup.calibration_for(train, law) for train in trains]
+    if options.memory is not None and len(trains) > 1:
+        raise SessionError(f"{options.memory}: a memory file is for one train, not for a line")
+    learned = -1 if options.memory is None else node.last_iteration(calibrations[0], options.memory)
     runs = setup.run_numbers(law, options.runs or loaded.scenario.runs, learned)
     if runs[-1] > RUNS_MAX:
         raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
     prepare(options.out)
     listener.begin(loaded, law, runs)
-    session = Session(options, loaded, law, runs, listener)
+    session = Session(options, loaded, trains, law, runs, listener)
     session.summary = {
         "schema": SCHEMA,
         "scenario": loaded.name,
@@ -110,9 +117,9 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     }
     try:
         if options.mode == "hil":
-            _run_hil(session, calibration)
+            _run_hil(session, calibrations)
         else:
-            _run_in_process(session, calibration)
+            _run_in_process(session, calibrations)
     except RunError as error:
         session.summary["ended_early"] = str(error)
         raise
@@ -144,56 +151,77 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 def _finish_run(
     session: Session,
     run: int,
-    frames: np.ndarray,
-    truth: np.ndarray,
+    frames: list[np.ndarray],
+    truths: list[np.ndarray],
     seconds: float,
-    faults: list[str],
+    faults: list[list[str]],
 ) -> dict[str, Any]:
-    """The row of a run, added to the summary and shown."""
-    measured = metrics.run_metrics(
-        session.loaded,
-        truth,
-        sil.commanded_force_n(frames, len(truth)),
-        setup.error_weight(session.loaded, session.law),
-    )
-    row = {"run": run, **measured, "ticks_per_s": len(truth) / seconds, "faults": faults}
+    """The row of a run, added to the summary and shown; a list has an entry for each train."""
+    measured = line.run_row(session.members, session.law, frames, truths)
+    row = {"run": run, **measured, "ticks_per_s": len(truths[0]) / seconds, "faults": faults[0]}
+    if "trains" in measured:
+        row["faults"] = [
+            f"train {train}: {name}" for train, names in enumerate(faults, 1) for name in names
+        ]
+        for of_train, names in zip(measured["trains"], faults, strict=True):
+            of_train["faults"] = names
     session.summary["runs"].append(row)
     session.listener.row(row)
     return row
 
 
-def _run_in_process(session: Session, calibration: Any) -> None:
+def _set_digest(session: Session, digest: str, of_trains: list[str]) -> None:
+    """The digest so far, and for a line that of each train."""
+    session.summary["digest"] = digest
+    if len(of_trains) > 1:
+        session.summary["digests"] = of_trains
+
+
+def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
     options, loaded = session.options, session.loaded
-    digest = Digest()
+    digest = LineDigest(len(calibrations))
+    nodes = [node.build(calibration, options.memory) for calibration in calibrations]
+    session.summary["controller"] = {
+        "state_bytes": nodes[0].state_bytes,
+        "memory_bytes": nodes[0].memory_bytes,
+    }
     writer = _trace_writer(session) if options.trace else None
     try:
-        for result, controller in sil.run(
+        for results in sil.run_line(
             loaded,
-            calibration,
+            nodes,
             runs=session.runs,
             seed=options.seed,
-            memory_file=options.memory,
             progress=session.listener.progress,
         ):
-            digest.update(result.frames)
-            session.summary["digest"] = digest.hex()
-            session.summary["controller"] = {
-                "state_bytes": controller.state_bytes,
-                "memory_bytes": controller.memory_bytes,
-            }
-            row = _finish_run(
-                session, result.run, result.frames, result.truth, result.seconds, result.faults
-            )
+            frames = [result.frames for result in results]
+            truths = [result.truth for result in results]
+            digest.update(frames)
+            _set_digest(session, digest.hex(), digest.of_trains())
+            run, seconds = results[0].run, results[0].seconds
+            faults = [result.faults for result in results]
+            row = _finish_run(session, run, frames, truths, seconds, faults)
             if writer is not None:
-                writer.frames(result.run, result.frames)
-                writer.truth(result.run, result.truth)
-                if has_lyapunov(loaded, session.law):
-                    column = lyapunov(loaded, session.law, result.frames, result.truth)
-                    writer.truth(result.run, column)
-                writer.run_summary(result.run, row)
+                for train, result in enumerate(results):
+                    writer.frames(run, result.frames, train)
+                    writer.truth(run, result.truth, train)
+                for table in _own_columns(session, frames, truths):
+                    for train, of_train in enumerate(table):
+                        writer.truth(run, of_train, train)
+                writer.run_summary(run, row)
     finally:
         if writer is not None:
             writer.close()
+
+
+def _own_columns(
+    session: Session, frames: list[np.ndarray], truths: list[np.ndarray]
+) -> Iterator[np.ndarray]:
+    """Tables [trains, ticks] of what only some laws or lines have, for the trace."""
+    if len(truths) > 1:
+        yield line.line_columns(session.members, session.law, frames, truths)
+    elif has_lyapunov(session.loaded, session.law):
+        yield lyapunov(session.loaded, session.law, frames[0], truths[0])[None]
 
 
 def _trace_settings(session: Session) -> dict[str, Any]:
@@ -209,6 +237,8 @@ def _trace_settings(session: Session) -> dict[str, Any]:
         "cars": len(loaded.scenario.train.effectiveness)
         if loaded.scenario.control.distribute
         else 0,
+        "trains": len(session.members),
+        "spacing_m": loaded.scenario.line.spacing_m if loaded.scenario.line else 0.0,
     }
 
 
@@ -231,22 +261,34 @@ def _recorder_arguments(session: Session, kept: Path) -> list[str]:
     return arguments
 
 
-def _run_hil(session: Session, calibration: Any) -> None:
+def line_buses(name: str, trains: int) -> list[str]:
+    """A bus for each train: vcan0, vcan1, …; a name without a number gets one."""
+    if trains == 1:
+        return [name]
+    stem = name.rstrip("0123456789")
+    first = int(name[len(stem) :] or 0)
+    return [f"{stem}{number}" for number in range(first, first + trains)]
+
+
+def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
     options, loaded = session.options, session.loaded
     choice = choose_bus(options.bus)
     if choice.interface == "virtual":
         raise SessionError(
             f"bus {options.bus!r} lives inside one process; HIL needs one between processes"
         )
+    buses = line_buses(choice.name, len(calibrations))
     session.summary["bus"] = choice.name
-    session.listener.note(f"bus {choice.name}: {choice.reason}")
-    _refuse_busy_bus(choice.name)
+    through = f" to {buses[-1]}" if len(buses) > 1 else ""
+    session.listener.note(f"bus {buses[0]}{through}: {choice.reason}")
+    for bus in buses:
+        _refuse_busy_bus(bus, BUSY_S / len(buses))
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch:
         kept = Path(scratch)
         events = hil.run(
             scenario=str(loaded.path),
-            calibration=calibration,
-            bus=choice.name,
+            controllers=calibrations,
+            buses=buses,
             runs=session.runs,
             seed=options.seed,
             out=options.out,
@@ -258,10 +300,10 @@ def _run_hil(session: Session, calibration: Any) -> None:
                 _on_event(session, bench, speaker.name, event, kept)
 
 
-def _refuse_busy_bus(name: str) -> None:
+def _refuse_busy_bus(name: str, listen_s: float) -> None:
     """Two sessions on one bus would answer each other."""
     with open_bus(name) as bus:
-        if recv_frames(bus, 0.3):
+        if recv_frames(bus, listen_s):
             raise SessionError(
                 f"bus {name!r} carries other traffic; choose another, e.g. --bus hub:second"
             )
@@ -273,7 +315,7 @@ def _on_event(
     kind = event["event"]
     if kind == "progress":
         session.listener.progress(event["run"], event["tick"])
-    elif kind == "ready" and name == "controller":
+    elif kind == "ready" and name.startswith("controller"):
         session.summary["controller"] = {
             "state_bytes": event["state_bytes"],
             "memory_bytes": event["memory_bytes"],
@@ -290,19 +332,23 @@ def _on_run(
 ) -> None:
     """Plant and recorder have both finished a run."""
     run = plant["run"]
-    session.summary["digest"] = recorder["digest"]
+    _set_digest(session, recorder["digest"], recorder["digests"])
     lost = {name: count for name, count in recorder["lost"].items() if count}
     if lost:
         session.listener.note(f"run {run}: the recorder missed frames: {lost}")
-    frames_file = kept / f"frames_{run}.npy"
-    frames = np.load(frames_file)
-    truth = np.load(plant["file"])
-    row = _finish_run(session, run, frames, truth, plant["seconds"], fault_names(plant["faults"]))
-    frames_file.unlink()
+    files = [
+        frames_folder(kept, train) / f"frames_{run}.npy" for train in range(len(session.members))
+    ]
+    frames = [np.load(file) for file in files]
+    truths = list(np.load(plant["file"]))
+    faults = [fault_names(bits) for bits in plant["faults"]]
+    row = _finish_run(session, run, frames, truths, plant["seconds"], faults)
+    for file in files:
+        file.unlink()
     tap = bench.nodes["recorder"]
     tap.command(command="truth", run=run, file=plant["file"])
-    if has_lyapunov(session.loaded, session.law):
-        lyapunov_file = kept / f"lyapunov_{run}.npy"
-        np.save(lyapunov_file, lyapunov(session.loaded, session.law, frames, truth))
-        tap.command(command="truth", run=run, file=str(lyapunov_file))
+    for number, table in enumerate(_own_columns(session, frames, truths)):
+        file = kept / f"columns_{run}_{number}.npy"
+        np.save(file, table)
+        tap.command(command="truth", run=run, file=str(file))
     tap.command(command="summary", run=run, row=row)

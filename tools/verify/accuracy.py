@@ -19,10 +19,9 @@ import numpy as np
 from can_dbc.codec import mailboxes
 from can_dbc.step import step
 from controller import firmware, memory, node
-from controller.calibration import Calibration
 from controller.interface import FAULTS_THAT_BLOCK_LEARNING
 from controller.registry import law_step, load_law
-from plant_sim.scenario import Loaded, load
+from plant_sim.scenario import Loaded, load, members
 from tools import setup, sil
 from tools.verify import FAILED, Row, identity, row
 from tools.verify.reference import Reference
@@ -96,9 +95,8 @@ def differences(law: str, reference: Reference, loaded: Loaded) -> tuple[float, 
     with sensors that only the DBC quantises: a coarser grid would blow a last bit up to a step."""
     module = load_law(law)
     loaded = ideal_sensors(loaded)
-    calibration = setup.calibration_for(loaded, law)
-    shadow, truth = _runs(module, reference, loaded, calibration, drive=0)
-    _follows, real = _runs(module, reference, loaded, calibration, drive=1)
+    shadow, truth = _runs(module, reference, loaded, law, drive=0)
+    _follows, real = _runs(module, reference, loaded, law, drive=1)
     mass = loaded.scenario.train.mass_kg
     return (
         shadow * mass,
@@ -118,11 +116,32 @@ def ideal_sensors(loaded: Loaded) -> Loaded:
 
 
 def _runs(
-    module: ModuleType, reference: Reference, loaded: Loaded, calibration: Calibration, drive: int
+    module: ModuleType, reference: Reference, loaded: Loaded, law: str, drive: int
 ) -> tuple[float, np.ndarray]:
-    """Largest difference of the force (m/s^2), and the plant's truth of all runs."""
+    """Largest difference of the force (m/s^2), and the truth of all runs, [trains, ticks]."""
+    pairs = [_pair(module, reference, train, law, drive) for train in members(loaded)]
+    truth = []
+    kept = [pair.state["law"]["real"]["memory"].copy() for pair in pairs]
+    numbers = setup.run_numbers(law, RUNS)
+    for results in sil.run_line(loaded, pairs, runs=numbers, seed=identity.SEED):
+        truth.append(np.stack([result.truth for result in results]))
+        for train, pair in enumerate(pairs):
+            # As the firmware does: a run with a fault leaves no trace in what is learned.
+            if int(pair.state["core"]["faults"][0]) & FAULTS_THAT_BLOCK_LEARNING:
+                pair.state["law"]["real"]["memory"] = kept[train]
+            else:
+                kept[train] = pair.state["law"]["real"]["memory"].copy()
+    largest = max(float(pair.state["law"]["difference"][0]) for pair in pairs)
+    return largest, np.concatenate(truth, axis=1)
+
+
+def _pair(
+    module: ModuleType, reference: Reference, loaded: Loaded, law: str, drive: int
+) -> node.Controller:
+    """A controller with both forms of the law."""
+    calibration = setup.calibration_for(loaded, law)
     scenario = loaded.scenario
-    gains = msgspec.convert(scenario.laws[calibration.law], module.Gains, strict=False)
+    gains = msgspec.convert(scenario.laws[law], module.Gains, strict=False)
     vehicle = setup.vehicle(scenario)
     real = reference.params(gains, vehicle)
     params = np.zeros(1, firmware.params_dtype(params_dtype(module, real)))
@@ -138,7 +157,7 @@ def _runs(
     if reference.words:
         state["law"]["real"]["memory"] = reference.initial(gains, vehicle) or 0.0
     tick = firmware.build_tick(build_pair(law_step(module), reference.force))
-    controller = node.Controller(
+    return node.Controller(
         calibration=calibration,
         tick=tick,
         call=node.callable_tick(tick),
@@ -150,14 +169,3 @@ def _runs(
         tx=mailboxes(),
         memory_file=None,
     )
-    numbers = setup.run_numbers(calibration.law, RUNS)
-    truth = []
-    kept = state["law"]["real"]["memory"].copy()
-    for result, _node in sil.run_controller(loaded, controller, runs=numbers, seed=identity.SEED):
-        truth.append(result.truth)
-        # As the firmware does: a run with a fault leaves no trace in what is learned.
-        if int(state["core"]["faults"][0]) & FAULTS_THAT_BLOCK_LEARNING:
-            state["law"]["real"]["memory"] = kept
-        else:
-            kept = state["law"]["real"]["memory"].copy()
-    return float(state["law"]["difference"][0]), np.concatenate(truth)
