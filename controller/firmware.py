@@ -127,7 +127,8 @@ CORE_STATE = np.dtype(
         ("quality", np.int32),
         ("map_section", np.int32),  # of the gradient map
         ("car_force", np.int32, (distribution.CARS_MAX,)),  # N Q4
-        ("sent", np.int32, (MESSAGE_COUNT,)),  # next end-to-end counter of each message sent
+        # Next end-to-end counter of each message sent; an even number, so that nothing is padded.
+        ("sent", np.int32, (MESSAGE_COUNT + MESSAGE_COUNT % 2,)),
     ],
     align=True,
 )

@@ -188,9 +188,7 @@ def catch(params: Any, state: Any, inputs: Any) -> None:
         drift = int64(inputs.speed) - int64(inputs.reference_speed)  # v - v_d
         growing = drift - (int64(state.offset_speed) >> 8)  # v - v_r
         if (excess > 0 and growing > 0) or (excess < 0 and growing < 0):
-            state.offset_speed = clamp(
-                drift << 8, -int64(OFFSET_SPEED_MAX), int64(OFFSET_SPEED_MAX)
-            )
+            state.offset_speed = drift << 8  # bound_speed follows
 
 
 @step
@@ -220,8 +218,8 @@ def wanted_acceleration(params: Any, state: Any, sides: Any, inputs: Any) -> Any
     wanted += separation.push_of_neighbours(params.separation, inputs)
     wanted += round_shift(sat32(total) * int64(params.consensus), 21)
     wanted = clamp(wanted, -int64(params.brake_max), int64(params.traction_max))
-    reference_speed = int64(inputs.speed) - drift
-    if reference_speed < STANDSTILL:
+    reference_speed = int64(inputs.reference_speed) + (int64(state.offset_speed) >> 8)
+    if reference_speed <= STANDSTILL:
         wanted = max(wanted, int64(0))
     if reference_speed >= int64(params.speed_max):
         wanted = min(wanted, int64(0))
@@ -229,17 +227,31 @@ def wanted_acceleration(params: Any, state: Any, sides: Any, inputs: Any) -> Any
 
 
 @step
-def advance(params: Any, state: Any, inputs: Any, acceleration: Any) -> None:
-    """off and offv a tick later, with v_r of now within its limits."""
+def bound_speed(params: Any, state: Any, inputs: Any) -> None:
+    """v_r within [0, v_max]."""
+    common = int64(inputs.reference_speed) << 8  # v_d, Q32
+    most = int64(params.speed_max) << 8
+    speed = clamp(int64(state.offset_speed), -common, most - common)
+    state.offset_speed = clamp(speed, -int64(OFFSET_SPEED_MAX), int64(OFFSET_SPEED_MAX))
+
+
+@step
+def stand(state: Any, inputs: Any) -> None:
+    """v_r = 0 exactly when the reference has come to rest: what the jerk of the timetable adds in a
+    tick would start it again."""
+    common = int64(inputs.reference_speed)
+    if common + (int64(state.offset_speed) >> 8) <= STANDSTILL:
+        state.offset_speed = -(common << 8)
+
+
+@step
+def advance(params: Any, state: Any, change: Any) -> None:
+    """off and offv a tick later; change = a_r - a_d, Q27."""
     period = int64(params.period)
-    common = int64(inputs.reference_acceleration)
     speed = int64(state.offset_speed)
     offset = int64(state.offset) + round_shift((speed >> 4) * period, 18)
     state.offset = clamp(offset, -int64(OFFSET_MAX), int64(OFFSET_MAX))
-    # v_d of the next tick is that of now and a_d Ts.
-    next_speed = (int64(inputs.reference_speed) << 8) + round_shift(common * period, 25)
-    speed += round_shift((acceleration - common) * period, 25)
-    speed = clamp(speed, -next_speed, (int64(params.speed_max) << 8) - next_speed)
+    speed += round_shift(change * period, 25)
     state.offset_speed = clamp(speed, -int64(OFFSET_SPEED_MAX), int64(OFFSET_SPEED_MAX))
 
 
@@ -253,11 +265,14 @@ def follow(params: Any, state: Any, sides: Any, inputs: Any) -> None:
         state.latched = 1
     if int64(state.latched) != 0:
         catch(params, state, inputs)
+        bound_speed(params, state, inputs)
         acceleration = wanted_acceleration(params, state, sides, inputs)
+        if acceleration == 0:
+            stand(state, inputs)
         offset = int64(state.offset) >> 25
         drift = int64(state.offset_speed) >> 8
         change = acceleration - int64(inputs.reference_acceleration)
-        advance(params, state, inputs, acceleration)
+        advance(params, state, change)
         inputs.reference_position = sat32(int64(inputs.reference_position) + offset)
         inputs.reference_speed = sat32(int64(inputs.reference_speed) + drift)
         inputs.reference_acceleration = acceleration
