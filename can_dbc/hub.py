@@ -40,6 +40,7 @@ from can_dbc.hub_server import (
     FD_FORMAT,
     FD_FRAME,
     FRAME,
+    INVERTED,
     OVERRUN,
     OWN,
     PROTOCOL,
@@ -328,10 +329,14 @@ def _socket_directory() -> Path:
 
 
 def _filter_words(filters: CanFilters | None) -> list[tuple[int, int]]:
-    """Filters of python-can as pairs of identifier word and mask."""
+    """Filters of python-can as pairs of identifier word and mask.
+
+    As on SocketCAN, `INVERTED` in an identifier stands for all frames that the filter refuses.
+    """
     words = []
     for each in filters or ():
-        can_id, mask = each["can_id"] & 0x1FFF_FFFF, each["can_mask"] & 0x1FFF_FFFF
+        can_id = each["can_id"] & (0x1FFF_FFFF | INVERTED)
+        mask = each["can_mask"] & 0x1FFF_FFFF
         if "extended" in each:
             mask |= EXTENDED
             can_id |= EXTENDED if each["extended"] else 0

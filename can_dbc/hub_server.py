@@ -15,7 +15,8 @@ Wire protocol, version `PROTOCOL`:
 - A connection opens with one line of JSON from the node and one from the hub:
   `{"fd": bool, "own": bool, "filters": [[id, mask], ...]}` -> `{"node": int, "pid": int}`, or
   `{"node": int, "filters": [...]}` -> `{"node": int}` to change the filters of that node; the hub
-  then closes this connection. A frame passes a filter when `(word ^ id) & mask == 0`.
+  then closes this connection. A frame passes a filter when `(word ^ id) & mask == 0`; an id with
+  `INVERTED` set passes the others.
 - Node to hub: frames back to back, each a Linux `struct can_frame` (16 bytes), or `canfd_frame`
   (72 bytes) for a node with `fd`: identifier word (little-endian), length, flags, two zero bytes,
   data.
@@ -42,6 +43,7 @@ ERROR = 0x2000_0000
 BITRATE_SWITCH = 0x01
 ERROR_STATE = 0x02
 FD_FORMAT = 0x04
+INVERTED = 0x2000_0000  # CAN_INV_FILTER; in the id of a filter
 # Flags that only the hub sets; linux/can.h leaves these bits free.
 OWN = 0x40  # the receiver sent this frame itself
 OVERRUN = 0x80  # the hub dropped frames of this receiver; their number is data[4:8]
@@ -255,7 +257,9 @@ def with_classic_size(frames: list[bytes]) -> list[bytes]:
 def passes(frame: bytes, filters: list[tuple[int, int]]) -> bool:
     """Whether the stamped frame matches one of the filters; error frames always do."""
     word = int.from_bytes(frame[8:12], "little")
-    return bool(word & ERROR) or any((word ^ can_id) & mask == 0 for can_id, mask in filters)
+    return bool(word & ERROR) or any(
+        ((word ^ can_id) & mask == 0) != bool(can_id & INVERTED) for can_id, mask in filters
+    )
 
 
 def enqueue(node: Node, frames: list[bytes]) -> None:

@@ -30,7 +30,7 @@ from controller import (
 )
 from controller.q import Q_ACCELERATION, Q_FORCE, Q_SPEED
 from controller.quantise import CalibrationError, Vehicle, fixed
-from controller.registry import law_number, load_law
+from controller.registry import law_label, law_number, load_law
 
 FORMAT = "ato-hil calibration 1"
 AGE_MAX_TICKS = 1000
@@ -103,7 +103,7 @@ def calibrate(
         params["law"] = module.calibrate(typed, vehicle)
         words = _words(module, typed, vehicle)
     except (msgspec.ValidationError, CalibrationError) as error:
-        raise CalibrationError(f"laws.{law}: {error}") from None
+        raise CalibrationError(f"laws.{law_label(law)}: {error}") from None
     params["gradient_map"] = gradient_map.calibrate(map_sections)
     params["guard"] = _guard(guard_settings)
     params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)

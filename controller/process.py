@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import can
@@ -25,30 +26,39 @@ from controller.registry import LawError
 RECEIVE_TIMEOUT_S = 0.1
 FRAME_IDS = [message.frame_id for message in MESSAGES]
 
+Frame = tuple[int, int]  # identifier and payload, as can_dbc.bus moves them
+
+
+def answers(controller: node.Controller, frames: Iterable[Frame]) -> Iterator[list[Frame]]:
+    """Takes frames as they come from the bus; gives the frames to send each time that the
+    controller answers."""
+    rx_payload, rx_fresh = controller.rx["payload"], controller.rx["fresh"]
+    tx_payload, tx_fresh = controller.tx["payload"], controller.tx["fresh"]
+    for frame_id, payload in frames:
+        index = INDEX_OF_FRAME_ID.get(frame_id)
+        if index is None:
+            continue
+        rx_payload[index] = payload
+        rx_fresh[index] = 1
+        if frame_id == TRAIN_POSITION.frame_id:
+            node.cycle(controller, 1)
+        elif frame_id == RUN_CTRL.frame_id and get(payload, RUN_CTRL.RunState) != RUNNING:
+            node.cycle(controller, 0)
+        else:
+            continue
+        rx_fresh.fill(0)
+        words = tx_payload.tolist()
+        sent = [(FRAME_IDS[i], words[i]) for i in tx_fresh.nonzero()[0].tolist()]
+        tx_fresh.fill(0)
+        if sent:
+            yield sent
+
 
 def serve(controller: node.Controller, bus: can.BusABC, stop: Stop) -> None:
     """Answers the plant until `stop`. Raises can.CanError if the bus is gone."""
-    rx_payload, rx_fresh = controller.rx["payload"], controller.rx["fresh"]
-    tx_payload, tx_fresh = controller.tx["payload"], controller.tx["fresh"]
     while not stop.requested:
-        for frame_id, payload in recv_frames(bus, RECEIVE_TIMEOUT_S):
-            index = INDEX_OF_FRAME_ID.get(frame_id)
-            if index is None:
-                continue
-            rx_payload[index] = payload
-            rx_fresh[index] = 1
-            if frame_id == TRAIN_POSITION.frame_id:
-                node.cycle(controller, 1)
-            elif frame_id == RUN_CTRL.frame_id and get(payload, RUN_CTRL.RunState) != RUNNING:
-                node.cycle(controller, 0)
-            else:
-                continue
-            rx_fresh.fill(0)
-            words = tx_payload.tolist()
-            answers = [(FRAME_IDS[i], words[i]) for i in tx_fresh.nonzero()[0].tolist()]
-            tx_fresh.fill(0)
-            if answers:
-                send_frames(bus, answers)
+        for frames in answers(controller, recv_frames(bus, RECEIVE_TIMEOUT_S)):
+            send_frames(bus, frames)
 
 
 def main() -> int:

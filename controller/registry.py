@@ -1,18 +1,25 @@
-"""The laws by name: `controller/laws/<law>.py`, with dashes for underscores on the command line."""
+"""The laws by name: `controller/laws/<law>.py`, with dashes for underscores on the command line;
+or a law of one's own by the path of its file, which ends in `.py`."""
 
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import pkgutil
+import sys
+import traceback
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from can_dbc.codec import choices
 from controller import laws
 
+PARTS = ("PARAMS", "STATE", "WORDS", "ESTIMATES", "Gains", "calibrate")  # of a law's module
+
 
 class LawError(ValueError):
-    """There is no such law; the message names those there are."""
+    """There is no such law, or its file is none; one line that says what was expected."""
 
 
 def law_names() -> list[str]:
@@ -20,11 +27,60 @@ def law_names() -> list[str]:
     return sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(laws.__path__))
 
 
+def is_file(name: str) -> bool:
+    """Whether a law is named by the path of its file."""
+    return name.endswith(".py")
+
+
+def law_label(name: str) -> str:
+    """What a law is called where its path says nothing: in gains tables, folders, memory files."""
+    return Path(name).stem.replace("_", "-") if is_file(name) else name
+
+
 def load_law(name: str) -> ModuleType:
-    """Module of a law. Raises LawError if there is none of that name."""
+    """Module of a law. Raises LawError if there is none of that name, or if its file is no law."""
+    if is_file(name):
+        return _load_file(Path(name))
     if name not in law_names():
         raise LawError(f"law {name!r} is unknown, expected one of {', '.join(law_names())}")
     return importlib.import_module(f"controller.laws.{name.replace('-', '_')}")
+
+
+def _load_file(path: Path) -> ModuleType:
+    """The module of a law outside this package, executed once in a process."""
+    name = f"own_law.{path.stem}"
+    known = sys.modules.get(name)
+    if known is not None and known.__file__ == str(path.resolve()):
+        return known
+    if not path.is_file():
+        raise LawError(f"{path}: no such law file")
+    spec = importlib.util.spec_from_file_location(name, path.resolve())
+    if spec is None or spec.loader is None or not path.stem.isidentifier():
+        raise LawError(f"{path}: the file of a law is named as its step, expected an identifier")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever the file does when it is executed
+        del sys.modules[name]
+        raise LawError(f"{_place(path, error)}: {type(error).__name__}: {error}") from None
+    for part in (*PARTS, path.stem):
+        if not hasattr(module, part):
+            del sys.modules[name]
+            raise LawError(f"{path}: expected {part}, see the laws in {laws.__path__[0]}")
+    return module
+
+
+def _place(path: Path, error: Exception) -> str:
+    """File and line of an error in a law's file."""
+    if isinstance(error, SyntaxError):
+        return f"{path}:{error.lineno}"
+    lines = [
+        frame.lineno
+        for frame in traceback.extract_tb(error.__traceback__)
+        if frame.filename == str(path.resolve())
+    ]
+    return f"{path}:{lines[-1]}" if lines else str(path)
 
 
 def law_step(module: ModuleType) -> Any:

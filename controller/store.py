@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from controller.calibration import Calibration
+from controller.registry import law_label
 
 MAGIC = b"ATOLEARN"
 VERSION = 1
@@ -45,7 +46,7 @@ def save(path: Path, calibration: Calibration, cells: np.ndarray, iteration: int
         cells.shape[0],
         cells.shape[1],
         cells.itemsize,
-        calibration.law.encode()[:32],
+        law_label(calibration.law).encode()[:32],
         calibration.scenario_digest.encode()[:64],
     )
     body = header + np.ascontiguousarray(cells).tobytes()
@@ -86,8 +87,9 @@ def load(path: Path, calibration: Calibration) -> Stored:
     digest = digest_bytes.rstrip(b"\0").decode(errors="replace")
     if version != VERSION:
         raise MemoryFileError(f"{path}: version {version}, expected {VERSION}")
-    if law != calibration.law:
-        raise MemoryFileError(f"{path}: learned by law {law!r}, expected {calibration.law!r}")
+    expected = law_label(calibration.law)
+    if law != expected:
+        raise MemoryFileError(f"{path}: learned by law {law!r}, expected {expected!r}")
     if digest != calibration.scenario_digest:
         raise MemoryFileError(
             f"{path}: learned on another scenario"

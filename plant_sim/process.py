@@ -84,6 +84,7 @@ def agree(
     while time.monotonic() < deadline:
         if stop.requested:
             raise Stopped
+        before = answered
         if faults is None:
             plant.announce(node, run_state, run, here.tx[train])
             post(here, train, bus)
@@ -98,6 +99,9 @@ def agree(
             # follows.
             if faults is not None and answered >= sent:
                 return faults
+        # A controller that has joined late did not hear them all.
+        if faults is not None and answered == before:
+            return faults
     what = "armed" if run_state == plant.ARMED else "ended"
     raise SilentNode(
         f"{controller_name(here, train)} is silent: no ATO_STATUS({what}) for run {run}"
@@ -165,6 +169,7 @@ def one_run(
     buses: list[can.BusABC],
     run: int,
     out: Path,
+    arming_s: float,
     timeout_s: float,
     stop: Stop,
 ) -> None:
@@ -172,7 +177,7 @@ def one_run(
     truth = np.zeros((len(buses), here.ticks), plant.TRUTH)
     file = out / f"truth_{run}.npy"
     for train, bus in enumerate(buses):
-        agree(here, train, bus, plant.ARMED, run, 2 * timeout_s, stop)
+        agree(here, train, bus, plant.ARMED, run, arming_s, stop)
     started = time.perf_counter()
     try:
         drive(here, buses, run, truth, timeout_s, stop)
@@ -209,6 +214,9 @@ def main() -> int:
     parser.add_argument("--last-run", type=int, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--timeout", type=float, default=1.0, help="silence that ends a run, s")
+    parser.add_argument(
+        "--patience", type=float, default=2.0, help="longest wait for the first answer, s"
+    )
     arguments = parser.parse_args()
     stop = Stop()
     commands: queue.Queue[dict[str, Any]] = queue.Queue()
@@ -226,8 +234,10 @@ def main() -> int:
     try:
         while commands.empty() and not stop.requested:
             time.sleep(0.005)
+        arming_s = arguments.patience
         for run in range(arguments.first_run, arguments.last_run + 1):
-            one_run(here, buses, run, arguments.out, arguments.timeout, stop)
+            one_run(here, buses, run, arguments.out, arming_s, arguments.timeout, stop)
+            arming_s = 2 * arguments.timeout
     except Stopped:
         return 0
     except SilentNode as error:

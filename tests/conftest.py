@@ -1,9 +1,14 @@
 """Settings of the whole suite."""
 
 import os
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import hypothesis
 import pytest
+
+from can_dbc import hub_server
 
 # No deadline: the first example of a test pays for compiling the step.
 # In CI the examples are the same each time.
@@ -17,3 +22,26 @@ def _no_bus_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep python-can from taking a bus that the user's shell configures for other programs."""
     for name in ("CAN_CONFIG", "CAN_INTERFACE", "CAN_CHANNEL", "CAN_BITRATE"):
         monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def runtime_dir(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A directory for the hub sockets of this test alone, with a short path."""
+    with tempfile.TemporaryDirectory(prefix="ato-", ignore_cleanup_errors=True) as directory:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", directory)
+        yield Path(directory)
+
+
+@pytest.fixture
+def hub_with(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., None]:
+    """Has hubs started with other constants."""
+
+    def change(**constants: float) -> None:
+        script = tmp_path / "changed_hub.py"
+        lines = ["import sys", f"sys.path.insert(0, {str(Path(hub_server.__file__).parent)!r})"]
+        lines += ["import hub_server"]
+        lines += [f"hub_server.{name} = {value!r}" for name, value in constants.items()]
+        script.write_text("\n".join([*lines, "hub_server.main()"]))
+        monkeypatch.setattr(hub_server, "__file__", str(script))
+
+    return change

@@ -18,6 +18,7 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from plant_sim.scenario import Loaded
+    from tools.bus_report import Report as BusReport
     from tools.verify import Row
 
 app = typer.Typer(
@@ -42,6 +43,13 @@ class Mode(StrEnum):
     hil = "hil"
     sil = "sil"
     mil = "mil"
+
+
+class External(StrEnum):
+    """A node that is not ours."""
+
+    controller = "controller"
+    plant = "plant"
 
 
 class Pace(StrEnum):
@@ -217,6 +225,14 @@ def run(
         typer.Option(help="Learning memory: read if it exists, written after each run."),
     ] = None,
     trace: Annotated[bool, typer.Option(help="Write trace.rrd.")] = True,
+    record: Annotated[
+        Path | None,
+        typer.Option(help="Record every frame of the runs: FILE.blf, .asc, .log or .mf4."),
+    ] = None,
+    external: Annotated[
+        list[External] | None,
+        typer.Option(help="A node of your own, started by yourself; may be given twice."),
+    ] = None,
 ) -> None:
     """Run a scenario: the train follows its profile, run by run."""
     if mode is Mode.mil and os.environ.get("ATO_HIL_INTERPRETED") != "1":
@@ -225,7 +241,8 @@ def run(
         environment = {**os.environ, "ATO_HIL_INTERPRETED": "1"}
         os.execve(sys.executable, [sys.executable, "-m", "tools.cli", *sys.argv[1:]], environment)
     with one_line_for_bad_input():
-        _run(scenario, law, runs, mode, bus, seed, out, memory, trace)
+        nodes = tuple(dict.fromkeys(node.value for node in external or ()))
+        _run(scenario, law, runs, mode, bus, seed, out, memory, trace, record, nodes)
 
 
 @contextmanager
@@ -250,14 +267,23 @@ def _run(
     out: Path | None,
     memory: Path | None,
     trace: bool,
+    record: Path | None,
+    external: tuple[str, ...],
 ) -> None:
+    from controller.registry import law_label
     from plant_sim.scenario import load
     from tools import session
     from tools.hil import RunError
 
     loaded = load(scenario)
-    folder = out or Path("runs") / f"{loaded.name}-{law or loaded.scenario.law}-{mode.value}"
-    options = session.Options(scenario, law, runs, mode.value, bus, seed, folder, memory, trace)
+    if External.controller in external:
+        name = session.EXTERNAL_LAW
+    else:
+        name = law_label(law or loaded.scenario.law)
+    folder = out or Path("runs") / f"{loaded.name}-{name}-{mode.value}"
+    options = session.Options(
+        scenario, law, runs, mode.value, bus, seed, folder, memory, trace, record, external
+    )
     screen = Screen(mode)
     try:
         with screen.bar:
@@ -269,11 +295,78 @@ def _run(
         _print_table(screen)
         raise _fail(f"interrupted; the runs so far are in {folder}", EXIT_INTERRUPTED) from None
     _print_table(screen)
+    if External.plant in external:
+        console.print("errors and energy are what the bus shows: measured, commanded")
     console.print(f"digest  {summary['digest']}")
     console.print(f"summary {folder / 'summary.json'}", soft_wrap=True)
     if trace:
         trace_file = folder / "trace.rrd"
         console.print(f"trace   {trace_file}   (open it with: rerun {trace_file})", soft_wrap=True)
+    if record is not None:
+        console.print(f"record  {record}   (again: ato-hil replay {record})", soft_wrap=True)
+
+
+@app.command()
+def replay(
+    recording: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Recording: .blf, .asc, .log (candump -L), .mf4.")
+    ],
+    scenario: Annotated[
+        str | None, typer.Option(help="Scenario; that of FILE.json by default.")
+    ] = None,
+    law: Annotated[
+        str | None, typer.Option(help="Control law; that of FILE.json by default.")
+    ] = None,
+    memory: Annotated[
+        Path | None,
+        typer.Option(help="Learning memory before the first run; only read."),
+    ] = None,
+    channel: Annotated[
+        str | None, typer.Option(help="The channel, if several carry our frames.")
+    ] = None,
+) -> None:
+    """Feed a recording to the controller alone; say where its commands first differ (exit 1)."""
+    with one_line_for_bad_input():
+        from tools import replay as open_loop
+
+        prepared = open_loop.prepare(recording, scenario, law, memory, channel)
+        console.print(
+            f"{prepared.loaded.name}, {prepared.calibration.law}: {len(prepared.runs)} runs",
+            soft_wrap=True,
+        )
+        for note in prepared.notes:
+            console.print(note, style="dim", soft_wrap=True, markup=False)
+        for result in open_loop.replay(prepared):
+            if result.difference is not None:
+                where = f"run {result.run}, tick {result.difference.tick}"
+                raise _fail(f"{recording}: {where}: {result.difference.text}", EXIT_BAD_INPUT)
+            console.print(
+                f"run {result.run}: {result.ticks} ticks, {result.commands} commands as recorded"
+            )
+
+
+@app.command()
+def decode(
+    recording: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Recording: .blf, .asc, .log (candump -L), .mf4.")
+    ],
+    out: Annotated[Path, typer.Option(help="Table to write: X.csv or X.parquet.")],
+    channel: Annotated[
+        str | None, typer.Option(help="The channel, if several carry our frames.")
+    ] = None,
+) -> None:
+    """Decode a recording to a table: a row for each frame, a column for each signal."""
+    with one_line_for_bad_input():
+        from tools import decode as tables
+
+        done = tables.decode(recording, out, channel)
+    console.print(f"{out}: {done.rows} frames, {len(done.messages)} messages", soft_wrap=True)
+    if done.unknown or done.foreign:
+        console.print(
+            f"left out: {done.unknown} frames that the DBC does not have,"
+            f" {done.foreign} of other kinds or channels",
+            style="dim",
+        )
 
 
 @app.command("list")
@@ -293,6 +386,33 @@ def list_scenarios() -> None:
     except ScenarioError as error:
         raise _fail(str(error), EXIT_BAD_INPUT) from None
     console.print(table)
+
+
+@app.command()
+def profile(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario or a .toml file.")],
+) -> None:
+    """Print the reference profile and the limit of each control period as CSV, for nodes of your
+    own."""
+    import numpy as np
+
+    from plant_sim.planner import limit_at
+    from plant_sim.scenario import load
+
+    with one_line_for_bad_input():
+        loaded = load(scenario)
+        plan, reference = loaded.scenario.profile, loaded.profile
+        limit_m_s = limit_at(plan.limits, np.arange(loaded.ticks), loaded.scenario.period_s)
+    columns = {
+        "position_m": reference.position_m,
+        "speed_m_s": reference.speed_m_s,
+        "acceleration_m_s2": reference.acceleration_m_s2,
+        "permitted_speed_m_s": limit_m_s,
+    }
+    lines = [",".join(["tick", *columns])]
+    for tick, row in enumerate(zip(*columns.values(), strict=True)):
+        lines.append(",".join([f"{tick}", *(f"{value:.7f}" for value in row)]))
+    typer.echo("\n".join(lines))
 
 
 @app.command()
@@ -401,6 +521,62 @@ def claims(
     surprises = [row.text for row in rows if row.holds != row.expected]
     if surprises:
         raise _fail(f"otherwise than found before: {'; '.join(surprises)}", EXIT_BAD_INPUT)
+
+
+@app.command("bus-report")
+def bus_report(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario or a .toml file.")],
+    law: Annotated[str | None, typer.Option(help="Control law; the scenario's by default.")] = None,
+    bitrate: Annotated[
+        int, typer.Option(min=10_000, max=1_000_000, help="Of the wire, bit/s.")
+    ] = 500_000,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, not a table.")] = False,
+) -> None:
+    """Say what a scenario's messages ask of a CAN wire: load and worst-case response times."""
+    import json
+
+    from controller.registry import load_law
+    from plant_sim.scenario import load
+    from tools.bus_report import report
+
+    with one_line_for_bad_input():
+        loaded = load(scenario)
+        name = law or loaded.scenario.law
+        load_law(name)
+        with console.status("finding out what is sent ..."):
+            found = report(loaded, name, bitrate)
+    if as_json:
+        typer.echo(json.dumps(found.as_json(), indent=1))
+    else:
+        _print_bus_report(found)
+    if found.complaints:
+        raise _fail(f"{bitrate} bit/s: {'; '.join(found.complaints)}", EXIT_BAD_INPUT)
+
+
+def _print_bus_report(found: BusReport) -> None:
+    headings = ("id", "message", "bytes", "frames\na tick", "cycle\nms", "frame\nbits", "load\n%")
+    table = Table(*headings, "response\nms", "deadline\nms", "margin\nms", header_style="bold")
+    for column in table.columns:
+        column.justify = "right"
+    table.columns[1].justify = "left"
+    for row in found.rows:
+        table.add_row(
+            f"{row.frame_id:#05x}",
+            row.message,
+            f"{row.data_bytes}",
+            f"{row.frames_per_tick:.2f}",
+            f"{row.cycle_ms:g}",
+            f"{row.frame_bits}",
+            f"{100 * row.load:.2f}",
+            "no bound" if row.response_ms is None else f"{row.response_ms:.3f}",
+            f"{row.cycle_ms:g}",
+            "-" if row.margin_ms is None else f"{row.margin_ms:.3f}",
+            style=None if row.meets_deadline else "red",
+        )
+    table.add_section()
+    load = f"{100 * found.load:.2f}"
+    table.add_row("", "all", "", f"{found.frames_per_tick:.2f}", "", "", load, "", "", "")
+    console.print(table)
 
 
 @app.command()

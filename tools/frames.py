@@ -6,14 +6,26 @@ bus: two runs that behaved alike have the same digest, whichever bus carried the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
 import xxhash
 
-from can_dbc.codec import ATO_ESTIMATE, database, decode_column
+from can_dbc import e2e
+from can_dbc.codec import (
+    ATO_ESTIMATE,
+    FORCE_CMD,
+    RUN_CTRL,
+    choices,
+    database,
+    decode_column,
+    get,
+)
+
+RUN_STATES = choices("RUN_CTRL", "RunState")
+ARMED, RUNNING, ENDED = (RUN_STATES[name] for name in ("armed", "running", "ended"))
 
 FRAME = np.dtype(
     [
@@ -68,6 +80,20 @@ def digest_of_line(digests: Sequence[str]) -> str:
     )
 
 
+def run_controls(frame_ids: np.ndarray, words: np.ndarray) -> Iterator[tuple[int, int, int]]:
+    """Row, run state and number of the run of each RUN_CTRL that passes its end-to-end check."""
+    for at in np.flatnonzero(frame_ids == RUN_CTRL.frame_id).tolist():
+        word = int(words[at])
+        if e2e.check(word, -1, RUN_CTRL.data_id) == e2e.OK:
+            yield at, int(get(word, RUN_CTRL.RunState)), int(get(word, RUN_CTRL.Iteration))
+
+
+def ticks_of(frame_ids: np.ndarray) -> np.ndarray:
+    """Tick of each frame of a run from its start: FORCE_CMD is the last frame of its tick."""
+    closes = frame_ids == FORCE_CMD.frame_id
+    return np.asarray(np.cumsum(closes) - closes)
+
+
 def columns(frames: np.ndarray, message: Any) -> tuple[np.ndarray, np.ndarray]:
     """Ticks (int32) and mailbox words (int64) of all frames of one message of `codec.MESSAGES`."""
     rows = np.flatnonzero(frames["frame_id"] == message.frame_id)
@@ -80,12 +106,21 @@ def decode(frames: np.ndarray, message: Any, signal: str) -> tuple[np.ndarray, n
     Of a multiplexed signal, only the frames that carry it.
     """
     ticks, words = columns(frames, message)
-    selector = _selector(message.name, signal)
+    selector = multiplexed_by(message.name, signal)
     if selector:
         multiplexer, value = selector
         carried = decode_column(words, getattr(message, multiplexer)) == value
         ticks, words = ticks[carried], words[carried]
     return ticks, physical(words, message, signal)
+
+
+def held(frames: np.ndarray, ticks: int, message: Any, signal: str) -> np.ndarray:
+    """Physical values (float64) of one signal in ticks 0 to `ticks` - 1; a tick without the frame
+    repeats the last, and is 0 before the first."""
+    at, values = decode(frames[frames["tick"] < ticks], message, signal)
+    row = np.zeros(ticks, np.int64)
+    row[at] = np.arange(1, len(at) + 1)
+    return np.concatenate(([0.0], values))[np.maximum.accumulate(row)]
 
 
 def physical(words: np.ndarray, message: Any, signal: str) -> np.ndarray:
@@ -105,7 +140,7 @@ def estimate(frames: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @cache
-def _selector(message: str, signal: str) -> tuple[str, int] | None:
+def multiplexed_by(message: str, signal: str) -> tuple[str, int] | None:
     """The multiplexer signal and the value of it at which a frame carries `signal`, if any."""
     source = database().get_message_by_name(message).get_signal_by_name(signal)
     if not source.multiplexer_ids:

@@ -1,5 +1,6 @@
 """HIL: recorder, controllers and plant as processes of their own, on a bus for each train; this
-process starts, watches and ends them.
+process starts, watches and ends them. A controller or plant that is not ours is started by its
+owner; an observer watches it instead.
 
 A process that dies, a node that falls silent or Ctrl-C ends the run within two seconds, names the
 cause, keeps the traces so far, and leaves no process and no socket behind.
@@ -14,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Generator
+from collections.abc import Collection, Generator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,9 +23,13 @@ from typing import IO, Any
 
 from controller import calibration as calibrations
 from controller.calibration import Calibration
+from tools.observer import CONTROLLER, PATIENCE_S, PLANT
 
 READY_TIMEOUT_S = 300.0  # the first start compiles
+# The plant's own limit while the observer judges a foreign controller, and names what is wrong.
+EXTERNAL_TIMEOUT_S = 3.0
 STOP_TIMEOUT_S = 0.7  # of a node that was asked to end
+RECORDER_TIMEOUT_S = 20.0  # from the end of the last run to the recorder's account of it
 
 
 class RunError(Exception):
@@ -117,8 +122,8 @@ class Bench:
                 raise RunError(f"{', '.join(late)} not ready within {READY_TIMEOUT_S:g} s")
 
     def end(self) -> None:
-        """Ends plant and controllers, then the recorder, which writes what it has; kills what does
-        not end."""
+        """Ends the other nodes, then the recorder, which writes what it has; kills what does not
+        end."""
         driving = [node for node in self.nodes.values() if node.name != "recorder"]
         for node in driving:
             if node.process.poll() is None:
@@ -175,39 +180,55 @@ def run(
     out: Path,
     memory_file: Path | None,
     recorder_arguments: list[str],
+    external: Collection[str] = (),
+    cars: int = 0,
 ) -> Generator[tuple[Node, dict[str, Any], Bench], None, None]:
-    """Events of the nodes until all runs are done and recorded; see the `tell` calls of the
-    processes. `controllers` and `buses` have an entry for each train.
+    """Events of the nodes, `ready` of each first, until all runs are done and recorded; see the
+    `tell` calls of the processes.
+
+    `buses` has an entry for each train, and so has `controllers`, or none where the controller is
+    one of the `external` nodes; `cars` are those that the plant takes a force for, each by itself.
 
     Raises RunError with one line if a node dies, falls silent or reports an error.
     """
-    on_buses = [argument for bus in buses for argument in ("--bus", bus)]
+    on_buses = [word for bus in buses for word in ("--bus", bus)]
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, Bench(out) as bench:
         recorder = bench.start("recorder", ["tools.recorder", *on_buses, *recorder_arguments])
-        for train, (calibration, bus) in enumerate(zip(controllers, buses, strict=True), start=1):
-            name = "controller" if len(buses) == 1 else f"controller-{train}"
-            file = flash(calibration, Path(scratch), name)
-            arguments = ["--calibration", str(file), "--bus", bus]
+        if external:
+            watched = [word for name in external for word in ("--external", name)]
+            watched += ["--cars", str(cars), "--runs", str(len(runs))]
+            leader = bench.start("observer", ["tools.observer", *on_buses, *watched])
+        if PLANT not in external:
+            plant_arguments = ["--scenario", scenario, "--seed", str(seed), "--out", scratch]
+            plant_arguments += ["--first-run", str(runs[0]), "--last-run", str(runs[-1])]
+            if CONTROLLER in external:
+                plant_arguments += ["--patience", f"{PATIENCE_S + EXTERNAL_TIMEOUT_S}"]
+                plant_arguments += ["--timeout", f"{EXTERNAL_TIMEOUT_S}"]
+            leader = bench.start(PLANT, ["plant_sim.process", *on_buses, *plant_arguments])
+        for train, calibration in enumerate(controllers):
+            name = CONTROLLER if len(controllers) == 1 else f"{CONTROLLER}-{train + 1}"
+            arguments = ["--calibration", str(flash(calibration, Path(scratch), name))]
             if memory_file is not None:
                 arguments += ["--memory", str(memory_file)]
-            bench.start(name, ["controller.process", *arguments])
-            if train == 1:
-                plant = bench.start(
-                    "plant",
-                    [
-                        "plant_sim.process",
-                        *("--scenario", scenario),
-                        *on_buses,
-                        *("--seed", str(seed)),
-                        *("--first-run", str(runs[0])),
-                        *("--last-run", str(runs[-1])),
-                        *("--out", scratch),
-                    ],
-                )
+            bench.start(name, ["controller.process", "--bus", buses[train], *arguments])
+            if train == 0:
                 bench.wait_ready()  # what the first controller compiles, the others load
         bench.wait_ready()
-        plant.command(command="start")
-        while "done" not in plant.said or recorder.said.get("run", {}).get("run") != runs[-1]:
+        for node in bench.nodes.values():
+            yield node, node.said["ready"], bench
+        leader.command(command="start")
+        deadline = None
+        while "done" not in leader.said or _last_run(recorder) != _last_run(leader):
             got = bench.next_event(0.5)
             if got is not None:
                 yield (*got, bench)
+            if "done" in leader.said:
+                deadline = deadline or time.monotonic() + RECORDER_TIMEOUT_S
+                if time.monotonic() > deadline:  # it may have lost just the frame that says so
+                    raise RunError(f"the recorder has not seen the end of run {_last_run(leader)}")
+
+
+def _last_run(node: Node) -> int | None:
+    """The last run that a node has told the end of."""
+    run: int | None = node.said.get("run", {}).get("run")
+    return run

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from controller.laws import drac
-from controller.registry import load_law
+from controller.registry import law_label, load_law
 from plant_sim.scenario import Loaded
 from plant_sim.trains import point
 from tools.frames import estimate
@@ -34,7 +34,9 @@ def lyapunov(loaded: Loaded, law: str, frames: np.ndarray, truth: np.ndarray) ->
     scenario = loaded.scenario
     train = scenario.train
     assert isinstance(train, point.Train)
-    gains = msgspec.convert(scenario.laws[law], load_law(law).Gains, strict=False)
+    gains = msgspec.convert(
+        scenario.laws.get(law_label(law), {}), load_law(law).Gains, strict=False
+    )
     ticks = len(truth)
     held = np.column_stack([_held(*estimate(frames, index), ticks) for index in range(4)])
 

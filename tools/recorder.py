@@ -9,8 +9,9 @@ It says on stdout, in JSON lines:
 
     {"event": "ready"}                                     it listens
     {"event": "run", "run": 1, "ticks": …, "frames": …,    a run has ended on every bus; lost frames
-     "lost": {…}, "digest": "…", "digests": ["…"],         by message, digest of all runs so far,
-     "complete": true}                                     and that of each train
+     "lost": {…}, "dropped": 0, "foreign": 0,              by message, as the buses counted them,
+     "digest": "…", "digests": ["…"],                      frames of other kinds, digest of all runs
+     "complete": true}                                     so far, and that of each train
     {"event": "error", "message": "…"}                     it ends early
 
 and takes on stdin:
@@ -43,8 +44,18 @@ import numpy as np
 from can_dbc import e2e
 from can_dbc.bus import FOREIGN, open_bus, recv_frames
 from can_dbc.child import Stop, follow_parent, tell
-from can_dbc.codec import FORCE_CMD, MESSAGES, RUN_CTRL, choices, decode_column
-from tools.frames import FRAME, Digest, columns, digest_of_line
+from can_dbc.codec import FORCE_CMD, MESSAGES, RUN_CTRL, decode_column
+from can_dbc.hub_server import ERROR
+from tools.frames import (
+    ENDED,
+    FRAME,
+    RUNNING,
+    Digest,
+    columns,
+    digest_of_line,
+    run_controls,
+    ticks_of,
+)
 from tools.trace import Reference, TraceWriter
 
 BATCH_TICKS = 1000  # of the trace
@@ -55,9 +66,6 @@ IDLE_S = 0.05  # longest wait for a frame, so that commands are heard
 SILENCE_S = 0.01  # at the end: the bus has nothing more
 DRAIN_S = 1.0  # at the end: longest wait for that
 FIRST_ROWS = 1 << 14
-
-RUN_STATES = choices("RUN_CTRL", "RunState")
-RUNNING, ENDED = RUN_STATES["running"], RUN_STATES["ended"]
 
 
 def tell_run(event: dict[str, Any]) -> None:
@@ -89,6 +97,8 @@ class RunsOfLine:
                     for number, each in enumerate(events, start=1)
                     for name, count in each["lost"].items()
                 },
+                "dropped": sum(each["dropped"] for each in events),
+                "foreign": sum(each["foreign"] for each in events),
                 "digest": digest_of_line(digests),
                 "digests": digests,
                 "complete": all(each["complete"] for each in events),
@@ -124,28 +134,30 @@ class Recorder:
         self._count = 0  # of _rows that are this run's
         self._logged = 0  # of these, in the trace
         self._logged_tick = 0
+        self._dropped = 0  # frames that the bus had dropped when the last run ended
+        self._foreign = 0  # frames of other kinds since then
 
     @property
     def frames(self) -> np.ndarray:
         """The FRAME rows of the current run so far."""
         return self._rows[: self._count]
 
-    def take(self, received: list[tuple[int, int]]) -> None:
-        """Take what `bus.recv_frames` gave."""
+    def take(self, received: list[tuple[int, int]], dropped: int = 0) -> None:
+        """Take what `bus.recv_frames` gave.
+
+        :param dropped: how many frames the bus has not been able to deliver so far.
+        """
         flat = np.fromiter(chain.from_iterable(received), np.int64, 2 * len(received))
         frame_ids, words = flat[0::2], flat[1::2]
         if (frame_ids >= FOREIGN).any():
+            self._foreign += int(np.sum((frame_ids >= FOREIGN) & (frame_ids & ERROR == 0)))
             ours = frame_ids < FOREIGN
             frame_ids, words = frame_ids[ours], words[ours]
         start = 0
-        for at in np.flatnonzero(frame_ids == RUN_CTRL.frame_id).tolist():
-            if e2e.check(int(words[at]), -1, RUN_CTRL.data_id) != e2e.OK:
-                continue
-            state = int(decode_column(words[at], RUN_CTRL.RunState))
-            number = int(decode_column(words[at], RUN_CTRL.Iteration))
+        for at, state, number in run_controls(frame_ids, words):
             if self.run is not None and (state != RUNNING or number != self.run):
                 self._append(frame_ids[start:at], words[start:at])
-                self._end_run(complete=state == ENDED and number == self.run)
+                self._end_run(state == ENDED and number == self.run, dropped)
             if self.run is None and state == RUNNING:
                 self._begin_run(number)
                 start = at
@@ -164,11 +176,14 @@ class Recorder:
         elif self._train == 0:
             self._trace.run_summary(command["run"], command["row"])
 
-    def finish(self) -> None:
-        """End a run that was cut short; the leader's also ends the trace, so it comes last. Raises
-        TraceError if that is incomplete."""
+    def finish(self, dropped: int = 0) -> None:
+        """End a run that was cut short; `dropped` as in `take`. The leader's also ends the trace,
+        so it comes last.
+
+        Raises TraceError if the trace is incomplete.
+        """
         if self.run is not None:
-            self._end_run(complete=False)
+            self._end_run(False, dropped)
         if self._trace is not None and self._train == 0:
             self._trace.close()
 
@@ -183,13 +198,11 @@ class Recorder:
             larger[: self._count] = self.frames
             self._rows = larger
         rows = self._rows[self._count : end]
-        closes = frame_ids == FORCE_CMD.frame_id
-        closed = np.cumsum(closes)
-        rows["tick"] = self.tick + closed - closes
+        rows["tick"] = self.tick + ticks_of(frame_ids)
         rows["frame_id"] = frame_ids
         rows["payload"] = words
         self._count = end
-        self.tick += int(closed[-1]) if len(closed) else 0
+        self.tick += int(np.count_nonzero(frame_ids == FORCE_CMD.frame_id))
 
     def _log(self, end: int) -> None:
         """Bring the trace up to row `end`."""
@@ -198,7 +211,7 @@ class Recorder:
         self._logged = end
         self._logged_tick = self.tick
 
-    def _end_run(self, complete: bool) -> None:
+    def _end_run(self, complete: bool, dropped: int) -> None:
         frames, number = self.frames, self.run
         assert number is not None
         self._log(self._count)
@@ -206,30 +219,40 @@ class Recorder:
         if self._keep_frames is not None:
             np.save(self._keep_frames / f"frames_{number}.npy", frames)
         lost = lost_frames(frames)
+        dropped_now = dropped - self._dropped
         if self._trace is not None:
-            for what in (
-                f"recorder lost frames: {lost}" if lost else "",
-                "" if complete else f"cut short at tick {self.tick}",
-            ):
-                if what:
-                    self._trace.text(number, self.tick, what, "WARN", self._train)
+            if lost or dropped_now:
+                text = f"recorder lost frames: {lost}, the bus dropped {dropped_now}"
+                self._trace.text(number, self.tick, text, "WARN", self._train)
+            if not complete:
+                text = f"cut short at tick {self.tick}"
+                self._trace.text(number, self.tick, text, "WARN", self._train)
         self._ended(
             {
                 "run": number,
                 "ticks": self.tick,
                 "frames": len(frames),
                 "lost": lost,
+                "dropped": dropped_now,
+                "foreign": self._foreign,
                 "digest": self._digest.hex(),
                 "complete": complete,
             }
         )
         self.run = None
+        self._dropped, self._foreign = dropped, 0
+
+
+def dropped_frames(bus: can.BusABC) -> int:
+    """How many frames the bus has not been able to deliver to this node, where it counts them."""
+    return int(getattr(bus, "frames_lost", 0))
 
 
 def lost_frames(frames: np.ndarray) -> dict[str, int]:
     """How many frames of each message are missing in a run, by their counters; only those > 0.
 
-    Fifteen frames of one message that are lost in a row are not seen.
+    Fifteen frames of one message that are lost in a row are not seen: what the bus itself counts
+    (`dropped_frames`) tells of them.
     """
     lost = {}
     for message in MESSAGES:
@@ -269,7 +292,7 @@ def listen(taps: list[tuple[can.BusABC, Recorder]], timeout_s: float) -> bool:
     for bus, recorder in taps:
         received = recv_frames(bus, timeout_s / len(taps))
         if received:
-            recorder.take(received)
+            recorder.take(received, dropped_frames(bus))
             heard = True
     return heard
 
@@ -350,8 +373,8 @@ def main() -> int:
         tell("error", message=f"recorder: {error}")
         status = 1
     try:
-        for _bus, recorder in reversed(taps):
-            recorder.finish()
+        for bus, recorder in reversed(taps):
+            recorder.finish(dropped_frames(bus))
     except (OSError, ValueError) as error:
         tell("error", message=f"recorder: {error}")
         status = 1

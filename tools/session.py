@@ -1,7 +1,8 @@
 """One session: the runs of one scenario and law in one mode, with their trace and summary.
 
 Modes: `sil` (one compiled loop), `mil` (the same loop interpreted, in a process started with
-ATO_HIL_INTERPRETED=1), `hil` (three processes on a bus). All give the same digest.
+ATO_HIL_INTERPRETED=1), `hil` (three processes on a bus). All give the same digest. In HIL
+plant or controller, or both, may be external: started by their owner, known by their frames alone.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import json
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,15 +23,18 @@ from controller import node
 from controller.calibration import Calibration
 from controller.interface import fault_names
 from controller.registry import load_law
-from plant_sim.scenario import Loaded, load, members
-from tools import hil, line, setup, sil
+from plant_sim.scenario import FOLDER, Loaded, load, members
+from tools import hil, line, record, setup, sil
 from tools.frames import LineDigest
 from tools.hil import RunError
 from tools.lyapunov import has_lyapunov, lyapunov
+from tools.observer import CONTROLLER, PATIENCE_S, PLANT, measured_truth
 from tools.recorder import frames_folder, save_settings
 
 SCHEMA = 1
+EXTERNAL_LAW = "external"  # of a controller that is not ours
 RUNS_MAX = 4095  # Iteration has 12 bits
+BACKLOG_RUNS = 4  # that a recording may be behind
 BUSY_S = 0.3  # how long to listen for other traffic, on all buses together
 
 
@@ -67,6 +71,8 @@ class Options:
     out: Path
     memory: Path | None
     trace: bool = True
+    record: Path | None = None  # recording of the frames
+    external: tuple[str, ...] = ()  # nodes that are not ours: plant, controller
 
 
 @dataclass
@@ -80,26 +86,25 @@ class Session:
     runs: range
     listener: Listener
     summary: dict[str, Any] = field(default_factory=dict)
+    recording: record.Recording | None = None
 
 
 def run(options: Options, listener: Listener) -> dict[str, Any]:
     """Runs the session; returns and writes the summary.
 
-    Raises ScenarioError, LawError, CalibrationError, BusError, MemoryFileError, SessionError for
-    bad input, RunError if a run ends early (the summary then holds the runs that were completed
-    and the reason), KeyboardInterrupt likewise.
+    Raises ScenarioError, LawError, CalibrationError, BusError, MemoryFileError, RecordError,
+    SessionError for bad input, RunError if a run ends early (the summary then holds the runs that
+    were completed and the reason), KeyboardInterrupt likewise.
     """
     loaded = load(options.scenario)
-    law = options.law or loaded.scenario.law
-    load_law(law)
     trains = members(loaded)
-    calibrations = [setup.calibration_for(train, law) for train in trains]
-    if options.memory is not None and len(trains) > 1:
-        raise SessionError(f"{options.memory}: a memory file is for one train, not for a line")
-    learned = -1 if options.memory is None else node.last_iteration(calibrations[0], options.memory)
-    runs = setup.run_numbers(law, options.runs or loaded.scenario.runs, learned)
+    if len(trains) > 1:
+        _refuse_what_is_for_one_train(options)
+    law, calibrations, runs = _controllers(options, trains)
     if runs[-1] > RUNS_MAX:
         raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
+    if options.record is not None:
+        record.check_target(options.record)
     prepare(options.out)
     listener.begin(loaded, law, runs)
     session = Session(options, loaded, trains, law, runs, listener)
@@ -109,6 +114,7 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         "law": law,
         "mode": options.mode,
         "bus": "none",
+        "external": list(options.external),
         "pace": "lockstep",
         "seed": options.seed,
         "digest": "",
@@ -131,6 +137,34 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     return session.summary
 
 
+def _refuse_what_is_for_one_train(options: Options) -> None:
+    """Raises SessionError for what a line of several trains has not."""
+    for what, asked in (
+        ("a memory file", options.memory),
+        ("a recording", options.record),
+        ("an external node", options.external),
+    ):
+        if asked:
+            raise SessionError(f"{what} is for one train, {options.scenario} is a line")
+
+
+def _controllers(options: Options, trains: list[Loaded]) -> tuple[str, list[Calibration], range]:
+    """The law, what the controllers are flashed with, and the numbers of the runs."""
+    loaded = trains[0]
+    if options.external and options.mode != "hil":
+        raise SessionError(f"an external node needs mode hil, this is {options.mode}")
+    count = options.runs or loaded.scenario.runs
+    if CONTROLLER in options.external:
+        if options.law is not None or options.memory is not None:
+            raise SessionError("law and memory of an external controller are its own")
+        return EXTERNAL_LAW, [], range(1, count + 1)
+    law = options.law or loaded.scenario.law
+    load_law(law)
+    calibrations = [setup.calibration_for(train, law) for train in trains]
+    learned = -1 if options.memory is None else node.last_iteration(calibrations[0], options.memory)
+    return law, calibrations, setup.run_numbers(law, count, learned)
+
+
 def prepare(out: Path) -> None:
     """An output folder without what an earlier session left. Raises SessionError."""
     try:
@@ -148,6 +182,30 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     os.replace(temporary, path)
 
 
+@contextmanager
+def _recording(session: Session) -> Iterator[None]:
+    """Records the runs of the session if that is asked for."""
+    options, loaded = session.options, session.loaded
+    if options.record is None:
+        yield
+        return
+    record.save_origin(
+        options.record,
+        scenario=loaded.path,
+        packaged=loaded.path.parent == FOLDER,
+        scenario_digest=loaded.digest,
+        law=session.law,
+        mode=options.mode,
+        seed=options.seed,
+        memory_file=options.memory,
+    )
+    # On a bus the next run goes on meanwhile. In one process it would only look slower for it.
+    backlog = BACKLOG_RUNS if options.mode == "hil" else 0
+    period_s = loaded.scenario.period_s
+    with record.Recording(options.record, period_s, backlog) as session.recording:
+        yield
+
+
 def _finish_run(
     session: Session,
     run: int,
@@ -155,10 +213,22 @@ def _finish_run(
     truths: list[np.ndarray],
     seconds: float,
     faults: list[list[str]],
+    frames_lost: int = 0,
 ) -> dict[str, Any]:
-    """The row of a run, added to the summary and shown; a list has an entry for each train."""
+    """The row of a run, added to the summary and shown; a list has an entry for each train.
+
+    `frames_lost` are frames that were on the buses and are not in `frames`.
+    """
+    if session.recording is not None:
+        session.recording.add(run, frames[0])
     measured = line.run_row(session.members, session.law, frames, truths)
-    row = {"run": run, **measured, "ticks_per_s": len(truths[0]) / seconds, "faults": faults[0]}
+    row = {
+        "run": run,
+        **measured,
+        "ticks_per_s": len(truths[0]) / seconds,
+        "frames_lost": frames_lost,
+        "faults": faults[0],
+    }
     if "trains" in measured:
         row["faults"] = [
             f"train {train}: {name}" for train, names in enumerate(faults, 1) for name in names
@@ -185,8 +255,11 @@ def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
         "state_bytes": nodes[0].state_bytes,
         "memory_bytes": nodes[0].memory_bytes,
     }
-    writer = _trace_writer(session) if options.trace else None
-    try:
+    with _recording(session), ExitStack() as stack:
+        writer = None
+        if options.trace:
+            writer = _trace_writer(session)
+            stack.callback(writer.close)
         for results in sil.run_line(
             loaded,
             nodes,
@@ -196,22 +269,18 @@ def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
         ):
             frames = [result.frames for result in results]
             truths = [result.truth for result in results]
+            faults = [result.faults for result in results]
             digest.update(frames)
             _set_digest(session, digest.hex(), digest.of_trains())
             run, seconds = results[0].run, results[0].seconds
-            faults = [result.faults for result in results]
             row = _finish_run(session, run, frames, truths, seconds, faults)
             if writer is not None:
-                for train, result in enumerate(results):
-                    writer.frames(run, result.frames, train)
-                    writer.truth(run, result.truth, train)
-                for table in _own_columns(session, frames, truths):
-                    for train, of_train in enumerate(table):
-                        writer.truth(run, of_train, train)
+                for train, of_train in enumerate(frames):
+                    writer.frames(run, of_train, train)
+                for table in (np.stack(truths), *_own_columns(session, frames, truths)):
+                    for train, column in enumerate(table):
+                        writer.truth(run, column, train)
                 writer.run_summary(run, row)
-    finally:
-        if writer is not None:
-            writer.close()
 
 
 def _own_columns(
@@ -220,26 +289,30 @@ def _own_columns(
     """Tables [trains, ticks] of what only some laws or lines have, for the trace."""
     if len(truths) > 1:
         yield line.line_columns(session.members, session.law, frames, truths)
-    elif has_lyapunov(session.loaded, session.law):
+    elif session.law != EXTERNAL_LAW and has_lyapunov(session.loaded, session.law):
         yield lyapunov(session.loaded, session.law, frames[0], truths[0])[None]
 
 
 def _trace_settings(session: Session) -> dict[str, Any]:
     """What a trace needs to know, as TraceWriter takes it."""
     loaded, law = session.loaded, session.law
-    module = load_law(law)
+    estimates = () if law == EXTERNAL_LAW else load_law(law).ESTIMATES
     return {
         "title": f"{loaded.name}, {law}, {session.options.mode}",
         "first_run": session.runs[0],
         "last_run": session.runs[-1],
         "period_s": loaded.scenario.period_s,
-        "estimates": [f"{name} [{unit}]" for name, unit, _q in module.ESTIMATES],
-        "cars": len(loaded.scenario.train.effectiveness)
-        if loaded.scenario.control.distribute
-        else 0,
+        "estimates": [f"{name} [{unit}]" for name, unit, _q in estimates],
+        "cars": _cars(loaded),
         "trains": len(session.members),
         "spacing_m": loaded.scenario.line.spacing_m if loaded.scenario.line else 0.0,
     }
+
+
+def _cars(loaded: Loaded) -> int:
+    """Cars that get a force of their own."""
+    scenario = loaded.scenario
+    return len(scenario.train.effectiveness) if scenario.control.distribute else 0
 
 
 def _trace_writer(session: Session) -> Any:
@@ -277,13 +350,14 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
         raise SessionError(
             f"bus {options.bus!r} lives inside one process; HIL needs one between processes"
         )
-    buses = line_buses(choice.name, len(calibrations))
+    buses = line_buses(choice.name, len(session.members))
     session.summary["bus"] = choice.name
     through = f" to {buses[-1]}" if len(buses) > 1 else ""
     session.listener.note(f"bus {buses[0]}{through}: {choice.reason}")
-    for bus in buses:
-        _refuse_busy_bus(bus, BUSY_S / len(buses))
-    with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch:
+    if PLANT not in options.external:  # which may well be there, and announce itself
+        for bus in buses:
+            _refuse_busy_bus(bus, BUSY_S / len(buses))
+    with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, _recording(session):
         kept = Path(scratch)
         events = hil.run(
             scenario=str(loaded.path),
@@ -294,10 +368,24 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
             out=options.out,
             memory_file=options.memory,
             recorder_arguments=_recorder_arguments(session, kept),
+            external=options.external,
+            cars=_cars(loaded),
         )
-        with closing(events):  # whatever ends the session ends the nodes
-            for speaker, event, bench in events:
-                _on_event(session, bench, speaker.name, event, kept)
+        try:
+            with closing(events):  # whatever ends the session ends the nodes
+                for speaker, event, bench in events:
+                    _on_event(session, bench, speaker.name, event, kept)
+        finally:
+            _record_the_rest(session, kept)
+
+
+def _record_the_rest(session: Session, kept: Path) -> None:
+    """What the recorder has of runs that were not completed."""
+    if session.recording is None:
+        return
+    for run in session.runs:
+        with suppress(OSError, ValueError):  # ValueError: the recorder was killed as it wrote
+            session.recording.add(run, np.load(kept / f"frames_{run}.npy"))
 
 
 def _refuse_busy_bus(name: str, listen_s: float) -> None:
@@ -313,42 +401,64 @@ def _on_event(
     session: Session, bench: hil.Bench, name: str, event: dict[str, Any], kept: Path
 ) -> None:
     kind = event["event"]
+    leader = "observer" if PLANT in session.options.external else PLANT
     if kind == "progress":
         session.listener.progress(event["run"], event["tick"])
-    elif kind == "ready" and name.startswith("controller"):
+    elif kind == "ready" and name.startswith(CONTROLLER):
         session.summary["controller"] = {
             "state_bytes": event["state_bytes"],
             "memory_bytes": event["memory_bytes"],
         }
-    elif name in ("plant", "recorder") and kind == "run":
-        plant, recorder = bench.nodes["plant"].said, bench.nodes["recorder"].said
+    elif kind == "ready" and name == "observer":
+        nodes = " and ".join(session.options.external)
+        session.listener.note(f"ready; the {nodes} may join within {PATIENCE_S:g} s")
+    elif name in (leader, "recorder") and kind == "run":
+        led, recorder = bench.nodes[leader].said, bench.nodes["recorder"].said
         run = event["run"]
-        if plant.get("run", {}).get("run") == run and recorder.get("run", {}).get("run") == run:
-            _on_run(session, bench, plant["run"], recorder["run"], kept)
+        if led.get("run", {}).get("run") == run and recorder.get("run", {}).get("run") == run:
+            _on_run(session, bench, led["run"], recorder["run"], kept)
 
 
 def _on_run(
-    session: Session, bench: hil.Bench, plant: dict[str, Any], recorder: dict[str, Any], kept: Path
+    session: Session, bench: hil.Bench, led: dict[str, Any], recorder: dict[str, Any], kept: Path
 ) -> None:
-    """Plant and recorder have both finished a run."""
-    run = plant["run"]
+    """The node that leads the runs, and the recorder, have both finished one."""
+    run = led["run"]
+    if session.options.external and recorder["ticks"] != led["ticks"]:
+        raise RunError(
+            f"run {run} has {led['ticks']} ticks, the recorder heard {recorder['ticks']}:"
+            " it began before the recorder was ready, or frames were lost"
+        )
     _set_digest(session, recorder["digest"], recorder["digests"])
-    lost = {name: count for name, count in recorder["lost"].items() if count}
-    if lost:
-        session.listener.note(f"run {run}: the recorder missed frames: {lost}")
+    lost, dropped = recorder["lost"], recorder["dropped"]
+    frames_lost = max(dropped, sum(lost.values()))
+    if frames_lost:
+        session.listener.note(
+            f"run {run}: the recorder missed {frames_lost} frames"
+            f" (the bus dropped {dropped}; by counters: {lost}); its digest is not that of the run"
+        )
+    if session.recording is not None and recorder["foreign"]:
+        session.listener.note(
+            f"run {run}: {recorder['foreign']} frames that are not standard data frames of 8 bytes"
+            " are not in the recording"
+        )
     files = [
         frames_folder(kept, train) / f"frames_{run}.npy" for train in range(len(session.members))
     ]
     frames = [np.load(file) for file in files]
-    truths = list(np.load(plant["file"]))
-    faults = [fault_names(bits) for bits in plant["faults"]]
-    row = _finish_run(session, run, frames, truths, plant["seconds"], faults)
     for file in files:
         file.unlink()
     tap = bench.nodes["recorder"]
-    tap.command(command="truth", run=run, file=plant["file"])
-    for number, table in enumerate(_own_columns(session, frames, truths)):
-        file = kept / f"columns_{run}_{number}.npy"
-        np.save(file, table)
-        tap.command(command="truth", run=run, file=str(file))
+    if PLANT in session.options.external:
+        period_s = session.loaded.scenario.period_s
+        truths = [measured_truth(frames[0], led["ticks"], period_s)]
+    else:
+        truths = list(np.load(led["file"]))
+        tap.command(command="truth", run=run, file=led["file"])
+        for number, table in enumerate(_own_columns(session, frames, truths)):
+            file = kept / f"columns_{run}_{number}.npy"
+            np.save(file, table)
+            tap.command(command="truth", run=run, file=str(file))
+    faults = [fault_names(bits) for bits in led["faults"]]
+    row = _finish_run(session, run, frames, truths, led["seconds"], faults, frames_lost)
     tap.command(command="summary", run=run, row=row)

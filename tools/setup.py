@@ -11,7 +11,7 @@ from controller.neighbours import NeighbourSettings
 from controller.node import Controller, build
 from controller.quantise import CalibrationError, Characteristic, Vehicle
 from controller.rebasing import RebasingSettings
-from controller.registry import load_law
+from controller.registry import is_file, law_label, load_law
 from plant_sim import track
 from plant_sim.scenario import Loaded, Scenario, ScenarioError
 from plant_sim.trains import point
@@ -19,16 +19,20 @@ from plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 
 def calibration_for(loaded: Loaded, law: str) -> Calibration:
-    """What the controller is flashed with for one law. Raises ScenarioError with file and key."""
+    """What the controller is flashed with for one law. Raises ScenarioError with file and key.
+
+    A law in a file of its own may do without a table of gains: its defaults count.
+    """
     scenario = loaded.scenario
-    if law not in scenario.laws:
+    gains = scenario.laws.get(law_label(law), {} if is_file(law) else None)
+    if gains is None:
         known = ", ".join(sorted(scenario.laws))
         raise ScenarioError(f"{loaded.path}: no gains for law {law!r}, the scenario has {known}")
     distribute = scenario.control.distribute
     try:
         return calibrate(
             law=law,
-            gains=scenario.laws[law],
+            gains=gains,
             vehicle=vehicle(scenario),
             profile=loaded.segments,
             preview_ticks=scenario.control.preview_ticks,
@@ -122,7 +126,7 @@ def error_weight(loaded: Loaded, law: str) -> float | None:
     """alpha of the augmented error: the law's own, else that of the scenario's default law, else
     None."""
     for name in (law, loaded.scenario.law):
-        alpha = loaded.scenario.laws[name].get("alpha")
+        alpha = loaded.scenario.laws.get(law_label(name), {}).get("alpha")
         if alpha is not None:
             return float(alpha)
     return None

@@ -22,7 +22,7 @@ from controller.calibration import Calibration
 from controller.interface import fault_names
 from plant_sim import plant, world
 from plant_sim.scenario import Loaded
-from tools.frames import FRAME, decode
+from tools.frames import FRAME, held
 
 FRAME_IDS = np.array([message.frame_id for message in MESSAGES], np.int32)
 
@@ -227,7 +227,4 @@ def _announce(
 
 def commanded_force_n(frames: np.ndarray, ticks: int) -> np.ndarray:
     """Total force of FORCE_CMD by tick, N; a tick without the frame repeats the last."""
-    at, force = decode(frames[frames["tick"] < ticks], FORCE_CMD, "Force")
-    latest = np.zeros(ticks, np.int64)
-    latest[at] = np.arange(len(at))
-    return force[np.maximum.accumulate(latest)] if len(at) else np.zeros(ticks)
+    return held(frames, ticks, FORCE_CMD, "Force")

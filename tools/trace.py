@@ -499,7 +499,7 @@ class TraceWriter:
 
     def _log_frames(self, run: int, train: int, frames: np.ndarray) -> None:
         """Log the frames as they were, a row a tick."""
-        import pyarrow as pa  # type: ignore[import-untyped]
+        import pyarrow as pa
 
         ticks, counts = np.unique(frames["tick"], return_counts=True)
         components = {name: pa.array(frames[name]) for name in ("frame_id", "payload")}

@@ -1,6 +1,5 @@
 """Nodes on an embedded bus of their own."""
 
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -8,13 +7,9 @@ import pytest
 
 from can_dbc.hub import HubBus
 
+TIMEOUT_S = 10.0  # of what must come
 
-@pytest.fixture
-def runtime_dir(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A directory for the sockets of this test alone, with a short path."""
-    with tempfile.TemporaryDirectory(prefix="ato-", ignore_cleanup_errors=True) as directory:
-        monkeypatch.setenv("XDG_RUNTIME_DIR", directory)
-        yield Path(directory)
+Frame = tuple[int, int]
 
 
 @pytest.fixture
@@ -29,3 +24,18 @@ def node(runtime_dir: Path) -> Iterator[Callable[..., HubBus]]:
     yield open_node
     for bus in buses:
         bus.shutdown()
+
+
+@pytest.fixture(scope="session")
+def received() -> Callable[[HubBus, int], list[Frame]]:
+    """Reads frames of a node until it has so many."""
+
+    def receive(bus: HubBus, count: int) -> list[Frame]:
+        frames: list[Frame] = []
+        while len(frames) < count:
+            new = bus.recv_frames(TIMEOUT_S)
+            assert new, f"only {len(frames)} of {count} frames came"
+            frames += new
+        return frames
+
+    return receive

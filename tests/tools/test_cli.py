@@ -83,6 +83,8 @@ def test_compare_lays_laws_side_by_side(tmp_path: Path) -> None:
         (["compare", "nowhere", "--laws", "cailc"], "scenario 'nowhere' is unknown"),
         (["claims", "nothing"], "no claims of 'nothing', expected one of cailc, drac"),
         (["claims", "cailc", "--json", "no/such/file.json"], "no/such/file.json: no such folder"),
+        (["replay", "none.blf"], "none.blf: cannot be read: No such file or directory"),
+        (["decode", "none.log", "--out", "x.csv"], "none.log: cannot be read: No such file"),
     ],
 )
 def test_bad_input_is_one_clear_line(tmp_path: Path, arguments: list[str], says: str) -> None:
@@ -90,6 +92,32 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, arguments: list[str], says:
     assert done.returncode == 1
     assert says in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_recording_is_replayed_and_decoded(recorded: Path, tmp_path: Path) -> None:
+    done = ato_hil("replay", str(recorded), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        "short, cailc: 2 runs",
+        "run 1: 2001 ticks, 3404 commands as recorded",
+        "run 2: 2001 ticks, 3404 commands as recorded",
+    ]
+    done = ato_hil("decode", str(recorded), "--out", "table.csv", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    frames = len((tmp_path / "table.csv").read_text().splitlines()) - 1
+    assert done.stdout == f"table.csv: {frames} frames, 8 messages\n"
+
+
+def test_a_command_that_differs_ends_the_replay(recorded: Path, tmp_path: Path) -> None:
+    lines = recorded.read_text().splitlines(keepends=True)
+    (at, *_) = [i for i, line in enumerate(lines) if "(0.100000) can0 0C0#" in line]
+    lines[at] = lines[at][:-4] + "1 R\n"
+    (tmp_path / "other.log").write_text("".join(lines))
+    scenario = str(recorded.with_name("short.toml"))
+    done = ato_hil("replay", "other.log", "--scenario", scenario, cwd=tmp_path)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("ato-hil: other.log: run 1, tick 10: FORCE_CMD.Tick is 10, recorded ")
 
 
 @pytest.mark.long

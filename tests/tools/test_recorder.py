@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import pairwise
@@ -21,7 +20,7 @@ from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
 from can_dbc import e2e
-from can_dbc.bus import FOREIGN, open_bus, send_frames
+from can_dbc.bus import FOREIGN, open_bus, recv_frames, send_frames
 from can_dbc.codec import (
     ATO_STATUS,
     ATP_LIMIT,
@@ -32,6 +31,7 @@ from can_dbc.codec import (
     choices,
     put,
 )
+from can_dbc.hub_server import ERROR
 from tools import recorder as recorder_module
 from tools.frames import FRAME, Digest
 from tools.recorder import FIRST_ROWS, Recorder, RunsOfLine, lost_frames, save_settings
@@ -144,6 +144,8 @@ def test_runs_last_from_running_to_ended(events, tmp_path: Path) -> None:
             "ticks": ticks,
             "frames": len(frames),
             "lost": {},
+            "dropped": 0,
+            "foreign": 0,
             "digest": digest.hex(),
             "complete": True,
         }
@@ -210,8 +212,10 @@ def test_frames_of_other_kinds_are_left_out(events) -> None:
     nodes = Nodes()
     frames = nodes.run(1, 5)
     recorder = Recorder()
-    recorder.take([frames[0], (FOREIGN | 0x123, -1), *frames[1:], (FOREIGN | 1 << 29, 0)])
+    recorder.take([frames[0], (FOREIGN | 0x123, -1), *frames[1:], (FOREIGN | 1 << 31, 0)])
     np.testing.assert_array_equal(recorder.frames, rows_of(frames))
+    recorder.take([(FOREIGN | ERROR | 4, 3 << 32), nodes.control(ENDED, 1)])
+    assert events[-1]["foreign"] == 2  # the error frame is nobody's message
 
 
 def test_a_stranger_on_the_bus_is_part_of_the_record(events) -> None:
@@ -318,26 +322,35 @@ def test_a_loss_is_said(events) -> None:
     (lost,) = events[-1]["lost"].items()
     assert lost[1] == 1
     assert trace.calls == [
-        ("text", 1, recorder.tick, f"recorder lost frames: {dict([lost])}", "WARN")
+        (
+            *("text", 1, recorder.tick),
+            *(f"recorder lost frames: {dict([lost])}, the bus dropped 0", "WARN"),
+        )
     ]
 
 
+def test_what_the_bus_counts_as_lost_is_said_with_the_run_that_ends_next(events) -> None:
+    trace = Log()
+    nodes = Nodes()
+    recorder = Recorder(trace)  # type: ignore[arg-type]
+    recorder.take([*nodes.run(1, 5), nodes.control(ENDED, 1)], 0)
+    recorder.take(nodes.run(2, 5), 15)
+    recorder.take([nodes.control(ENDED, 2)], 16)
+    recorder.take([*nodes.run(3, 5), nodes.control(ENDED, 3)], 16)
+    recorder.take(nodes.run(4, 5), 17)
+    recorder.finish(18)
+    assert [event["dropped"] for event in events] == [0, 16, 0, 2]
+    assert trace.calls[0][3] == "recorder lost frames: {}, the bus dropped 16"
+
+
 # The process
-
-
-@pytest.fixture
-def runtime_dir(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Hub sockets of this test alone, with a short path."""
-    with tempfile.TemporaryDirectory(prefix="ato-", ignore_cleanup_errors=True) as directory:
-        monkeypatch.setenv("XDG_RUNTIME_DIR", directory)
-        yield
 
 
 Start = Callable[..., subprocess.Popen[str]]
 
 
 @pytest.fixture
-def start(runtime_dir: None, tmp_path: Path) -> Iterator[Start]:
+def start(runtime_dir: Path, tmp_path: Path) -> Iterator[Start]:
     """Starts recorders on the hub, and waits until they listen."""
     processes: list[subprocess.Popen[str]] = []
 
@@ -486,6 +499,27 @@ def test_a_hub_that_dies_is_an_error_and_the_trace_is_kept(start: Start, tmp_pat
         assert process.wait(30) == 2
     RrdReader(str(tmp_path / "trace.rrd")).store()
     assert "/bus/speed/run_01" in entities(tmp_path / "trace.rrd")
+
+
+def test_frames_that_the_hub_drops_are_counted(start: Start, hub_with, tmp_path: Path) -> None:
+    hub_with(QUEUE_FRAMES=2000)
+    nodes = Nodes()
+    with open_bus("hub") as bus, open_bus("hub") as witness:
+        process = start()
+        frames = nodes.run(1, 30_000)
+        process.send_signal(signal.SIGSTOP)
+        for begin in range(0, len(frames), 1000):
+            batch = frames[begin : begin + 1000]
+            send_frames(bus, batch)
+            heard = 0
+            while heard < len(batch):  # so that the hub has passed them on
+                heard += len(recv_frames(witness, 10.0))
+        process.send_signal(signal.SIGCONT)
+        tell(process, command="stop")
+        event = next_event(process)
+        assert process.wait(30) == 0
+    assert event["dropped"] > 0
+    assert event["frames"] + event["dropped"] == len(frames)
 
 
 def test_without_trace_there_is_no_file(start: Start, tmp_path: Path) -> None:

@@ -9,10 +9,15 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from tools.cli import Mode, Screen
+from tools.session import Options, SessionError, run
 
 SHORT = """
 base = "subway-fast"
@@ -61,10 +66,16 @@ def channel(tmp_path: Path) -> str:
 
 
 def test_hil_gives_the_bits_of_sil(short: Path, tmp_path: Path) -> None:
-    sil = ato_hil("run", str(short), "--mode", "sil", "--out", "sil", cwd=tmp_path)
+    sil = ato_hil(
+        *("run", str(short), "--mode", "sil", "--out", "sil", "--record", "sil.log"), cwd=tmp_path
+    )
     assert sil.returncode == 0, sil.stderr
-    hil = ato_hil("run", str(short), "--bus", channel(tmp_path), "--out", "hil", cwd=tmp_path)
+    hil = ato_hil(
+        *("run", str(short), "--bus", channel(tmp_path), "--out", "hil", "--record", "hil.log"),
+        cwd=tmp_path,
+    )
     assert hil.returncode == 0, hil.stderr
+    assert (tmp_path / "sil.log").read_bytes() == (tmp_path / "hil.log").read_bytes()
     one, other = summary(tmp_path / "sil"), summary(tmp_path / "hil")
     assert one["digest"] == other["digest"]
     for a, b in zip(one["runs"], other["runs"], strict=True):
@@ -145,6 +156,8 @@ def test_learning_goes_on_from_a_memory_file(short: Path, tmp_path: Path) -> Non
         (["run", "subway", "--bus", "virtual:x"], "lives inside one process"),
         (["run", "subway", "--memory", "foreign.bin"], "foreign.bin: not a learning memory"),
         (["run", "subway", "--out", "a-file/x"], "a-file/x: cannot write there"),
+        (["run", "subway", "--record", "x.pcap"], "x.pcap: expected a name that ends in .blf, "),
+        (["run", "subway", "--record", "no/x.blf"], "no/x.blf: there is no folder"),
     ],
 )
 def test_bad_input_is_one_clear_line(tmp_path: Path, arguments: list[str], says: str) -> None:
@@ -167,6 +180,30 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, arguments: list[str], says:
     assert says in done.stderr
     assert "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ({"mode": "sil", "external": ("plant",)}, "needs mode hil, this is sil"),
+        ({"law": "pid", "external": ("controller",)}, "law and memory .* are its own"),
+        ({"memory": Path("m"), "external": ("controller",)}, "law and memory .* are its own"),
+    ],
+)
+def test_options_that_do_not_go_together(tmp_path: Path, more: dict[str, Any], says: str) -> None:
+    options = Options(
+        scenario="subway",
+        law=None,
+        runs=None,
+        mode="hil",
+        bus="hub",
+        seed=1,
+        out=tmp_path / "out",
+        memory=None,
+    )
+    with pytest.raises(SessionError, match=says):
+        run(replace(options, **more), Screen(Mode.hil))
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_dbc_without_a_needed_signal_is_one_clear_line(tmp_path: Path) -> None:
@@ -200,6 +237,8 @@ def start_long_run(tmp_path: Path) -> subprocess.Popen[str]:
             "out",
             "--bus",
             channel(tmp_path),
+            "--record",
+            "cut.blf",
         ],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
@@ -265,6 +304,12 @@ def test_what_ends_a_run_early_is_named_and_leaves_nothing_behind(
             check=False,
         )
         assert check.returncode == 0, check.stderr
+    if victim is None:
+        # Nothing is missing in what was recorded of the run that was cut short.
+        again = ato_hil("replay", "cut.blf", cwd=tmp_path)
+        assert again.returncode == 0, again.stderr
+        assert "missing" not in again.stdout
+        assert "commands as recorded" in again.stdout.splitlines()[-1]
 
 
 def test_two_sessions_do_not_share_a_bus(tmp_path: Path) -> None:

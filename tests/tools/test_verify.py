@@ -227,7 +227,7 @@ def search_mutant(folder: Path, old: str, new: str) -> str:
 )
 def test_the_search_catches(old, new, error, tmp_path):
     found = search_mutant(tmp_path, old, new)
-    assert found
+    assert found.startswith("pid.py:"), found
     if "{line}" in error:
         text = (tmp_path / "pid.py").read_text(encoding="utf-8").splitlines()
         stores = ("state.last = eps", "outputs.force = wanted")

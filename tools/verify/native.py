@@ -1,7 +1,7 @@
 """The machine's view of a step: its optimised LLVM module, alone, without Python around it.
 
-The only module that knows numba's internals (`compile_extra`, `Flags`); numba and llvmlite are
-pinned for it.
+This module and `checked.py` alone know numba's internals (`compile_extra`, `Flags`, `lowering`);
+numba and llvmlite are pinned for them.
 """
 
 from __future__ import annotations

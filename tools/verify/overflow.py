@@ -13,6 +13,7 @@ import subprocess
 import sys
 import traceback
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import msgspec
@@ -21,9 +22,10 @@ import numpy as np
 from can_dbc.step import INTERPRETED
 from controller.interface import INPUTS, OUTPUTS
 from controller.memory import CELL
-from controller.registry import law_step
+from controller.registry import law_step, load_law
 
 ROOT = Path(__file__).resolve().parents[2]
+LAWS = "controller/laws/"
 SEARCH_SEED = 20
 EDGES = np.array(
     [0, 1, -1, 2**31 - 1, -(2**31), 2**31 - 2, -(2**31) + 1, 2**30, -(2**30)], np.int64
@@ -70,8 +72,11 @@ class _Peaks:
 
         step.Checked.__new__ = new  # type: ignore[method-assign]
 
-    def largest(self, folder: str) -> tuple[int, str]:
-        """Bits and place of the largest intermediate in the files of a folder."""
+    def largest(self, law: ModuleType) -> tuple[int, str]:
+        """Bits and place of the largest intermediate in the file of a law, or for a packaged one in
+        all laws: they build on each other."""
+        file = place(str(law.__file__))
+        folder = LAWS if file.startswith(LAWS) else file
         best = max(
             (
                 (magnitude, code, line)
@@ -98,11 +103,8 @@ def place(file: str) -> str:
 def where(error: BaseException) -> str:
     """File, line and reason of an error raised in a step."""
     frames = traceback.extract_tb(error.__traceback__)
-    ours = [
-        f
-        for f in frames
-        if not f.filename.endswith("can_dbc/step.py") and "numpy" not in f.filename
-    ]
+    checks = ("can_dbc/step.py", "tools/verify/overflow.py")
+    ours = [f for f in frames if not f.filename.endswith(checks) and "numpy" not in f.filename]
     last = ours[-1]
     return f"{place(last.filename)}:{last.lineno}: {error}"
 
@@ -143,7 +145,7 @@ def search(module: Any, params: list[np.ndarray], cases: int) -> Report:
                 return Report(error=text, cases=case + 1)
         if peaks.magnitude() > largest:  # over all cases so far: grows only with a new record
             largest, best = peaks.magnitude(), records
-    bits, at = peaks.largest("controller/laws/")
+    bits, at = peaks.largest(module)
     return Report(bits=bits, at=at, cases=cases)
 
 
@@ -225,21 +227,20 @@ def scenario_run(scenario: str, law: str, runs: int, ticks: int) -> Report:
             digest.update([result.frames for result in results])
     except OverflowError as error:
         return Report(error=where(error))
-    bits, at = peaks.largest("controller/laws/")
+    bits, at = peaks.largest(load_law(law))
     cases = runs * loaded.ticks * len(nodes)
     return Report(bits=bits, at=at, cases=cases, digest=digest.hex())
 
 
 def calibrated(law: str) -> list[np.ndarray]:
-    """PARAMS of a law in every packaged scenario that has gains for it."""
-    from plant_sim.scenario import load, scenario_names
+    """PARAMS of a law in every scenario that has gains for it."""
+    from plant_sim.scenario import load
     from tools.setup import calibration_for
+    from tools.verify.identity import scenarios_of
 
-    scenarios = [load(name) for name in scenario_names()]
     return [
-        np.ascontiguousarray(calibration_for(s, law).params["law"])
-        for s in scenarios
-        if law in s.scenario.laws
+        np.ascontiguousarray(calibration_for(load(name), law).params["law"])
+        for name in scenarios_of(law)
     ]
 
 
@@ -261,8 +262,6 @@ def ask(*arguments: str, timeout_s: float = 1800) -> Report:
 
 def main(arguments: list[str]) -> None:
     """The process: `LAW --cases N` searches, `LAW --scenario S` runs."""
-    from controller.registry import load_law
-
     parser = argparse.ArgumentParser()
     parser.add_argument("law")
     parser.add_argument("--cases", type=int, default=0)

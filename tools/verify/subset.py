@@ -101,7 +101,9 @@ def linted_modules(laws: list[str]) -> list[ModuleType]:
     for module in found:  # grows as it goes
         for value in vars(module).values():
             owner = str(getattr(value, "__module__", ""))
-            if owner.startswith("controller.laws.") and owner not in {m.__name__ for m in found}:
+            if owner.startswith(("controller.laws.", "own_law.")) and owner not in {
+                m.__name__ for m in found
+            }:
                 found.append(importlib.import_module(owner))
     return found
 
