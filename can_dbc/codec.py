@@ -39,6 +39,13 @@ NEEDED: dict[str, tuple[str, ...]] = {
     "ATO_STATUS": ("Law", "RunState", "Guard", "Faults", "Iteration"),
     "ATO_TRACKING": ("PositionError", "SpeedError"),
     "ATO_ESTIMATE": ("Index", "Exponent", *(f"Estimate{i}" for i in range(10))),
+    "ATO_RADIO": (
+        "OffsetSpeed",
+        "Rebased",
+        "EmergencyBrakeToRear",
+        "EmergencyBrakeToFront",
+        "Offset",
+    ),
     "FORCE_CMD": ("Force", "Mode", "Tick"),
 }
 
@@ -137,6 +144,7 @@ MESSAGES: tuple[Any, ...] = tuple(
     ATO_STATUS,
     ATO_TRACKING,
     ATO_ESTIMATE,
+    ATO_RADIO,
     FORCE_CMD,
 ) = MESSAGES
 MESSAGE_COUNT = len(MESSAGES)

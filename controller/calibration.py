@@ -18,7 +18,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from controller import distribution, firmware, gradient_map, guard, memory, reference
+from controller import (
+    distribution,
+    firmware,
+    gradient_map,
+    guard,
+    memory,
+    neighbours,
+    rebasing,
+    reference,
+)
 from controller.q import Q_ACCELERATION, Q_FORCE, Q_SPEED
 from controller.quantise import CalibrationError, Recall, Vehicle, fixed
 from controller.registry import law_label, law_number, load_law
@@ -46,6 +55,18 @@ class GuardSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 @dataclass(frozen=True)
+class Line:
+    """The place of a train on a line of several, and what it makes of its neighbours."""
+
+    start_m: float  # of its timetable against the common one
+    spacing_m: float  # S0, to each neighbour
+    ahead: bool  # there is a train ahead
+    behind: bool
+    neighbours: neighbours.NeighbourSettings
+    rebasing: rebasing.RebasingSettings | None = None  # none: it stays on its timetable
+
+
+@dataclass(frozen=True)
 class Calibration:
     """What a controller is flashed with."""
 
@@ -70,6 +91,7 @@ def calibrate(
     car_traction_max_n: Sequence[float] = (),
     car_brake_max_n: Sequence[float] = (),
     map_sections: Sequence[tuple[float, float, float]] = (),
+    line: Line | None = None,
     scenario_digest: str,
 ) -> Calibration:
     """PARAMS of the firmware for one law on one scenario. Raises CalibrationError or LawError with
@@ -91,6 +113,8 @@ def calibrate(
         preview_ticks = recall.ahead_ticks
         memory_settings = MemorySettings()
     params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
+    if line is not None:
+        _line(params, line, vehicle.period_s)
     params["memory"] = _memory(words, memory_settings, ticks)
     if recall is not None:
         _recall(params["memory"], recall)
@@ -119,6 +143,24 @@ def _guard(settings: GuardSettings) -> np.ndarray:
         "control.guard.overspeed_margin_m_s", settings.overspeed_margin_m_s, Q_SPEED
     )
     return params
+
+
+def _line(params: np.ndarray, line: Line, period_s: float) -> None:
+    """PARAMS of what a train makes of its neighbours, in place."""
+    params["neighbours"] = neighbours.calibrate(
+        line.neighbours,
+        period_s=period_s,
+        start_m=line.start_m,
+        ahead=line.ahead,
+        behind=line.behind,
+    )
+    if line.rebasing is not None:
+        try:
+            params["rebasing"] = rebasing.calibrate(
+                line.rebasing, period_s=period_s, spacing_m=line.spacing_m
+            )
+        except CalibrationError as error:
+            raise CalibrationError(f"control.rebasing: {error}") from None
 
 
 def _whole(key: str, value: int, low: int, high: int) -> int:

@@ -4,8 +4,9 @@ Contract of `tick(params, profile, state, memory, rx, tx, period)`: a step. It r
 (mailboxes, cleared by the caller after the tick), `params`, `profile`; writes `state`, `memory`,
 `tx`; takes bounded time; never raises, whatever is in the mailboxes. `period` is 1 when a control
 period has passed, 0 to look at RUN_CTRL alone. In order: decode and end-to-end check, ages, the
-onboard reference, the law, the guard, distribution over the cars, encode and protect. The process
-around it moves payloads and stores the learning memory, nothing else.
+onboard reference, the neighbours and what they make of it, the law, the guard, distribution over
+the cars, encode and protect. The process around it moves payloads and stores the learning memory,
+nothing else.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from can_dbc import e2e
 from can_dbc.codec import (
     ATO_ESTIMATE,
+    ATO_RADIO,
     ATO_STATUS,
     ATO_TRACKING,
     ATP_LIMIT,
@@ -26,6 +28,10 @@ from can_dbc.codec import (
     CAR_FORCE_4,
     FORCE_CMD,
     MESSAGE_COUNT,
+    NEIGHBOUR_AHEAD_MOTION,
+    NEIGHBOUR_AHEAD_POSITION,
+    NEIGHBOUR_BEHIND_MOTION,
+    NEIGHBOUR_BEHIND_POSITION,
     RUN_CTRL,
     TRAIN_POSITION,
     TRAIN_SPEED,
@@ -35,15 +41,29 @@ from can_dbc.codec import (
     saturate,
 )
 from can_dbc.step import int64, step
-from controller import distribution, gradient_map, guard, memory, reference
+from controller import (
+    distribution,
+    gradient_map,
+    guard,
+    memory,
+    neighbours,
+    rebasing,
+    reference,
+)
 from controller.interface import (
+    AHEAD,
     ARMED,
+    BEHIND,
     BRAKE,
     COAST,
     ENDED,
     ESTIMATES_MAX,
+    FAULT_LINE_EMERGENCY,
+    FAULT_NEIGHBOUR_LOST,
+    FAULT_REBASED,
     FAULT_TICK,
     GUARD_NORMAL,
+    GUARD_SERVICE_BRAKE,
     IDLE,
     INPUTS,
     OUTPUTS,
@@ -59,7 +79,7 @@ from controller.q import (
     sat32,
 )
 
-STATUS_PERIOD = 10  # ticks between ATO_STATUS frames
+STATUS_PERIOD = 10  # ticks between ATO_STATUS frames, and between ATO_RADIO frames
 TICK_MASK = 0xFFFF
 
 # From raw signals to the firmware's formats; the scales are the DBC's.
@@ -68,6 +88,8 @@ _POSITION_SHIFT = Q_POSITION - binary_exponent(TRAIN_POSITION, "Position")
 _FORCE_SHIFT = Q_FORCE - binary_exponent(FORCE_CMD, "Force")
 _POSITION_ERROR_SHIFT = Q_POSITION - binary_exponent(ATO_TRACKING, "PositionError")
 _SPEED_ERROR_SHIFT = Q_SPEED - binary_exponent(ATO_TRACKING, "SpeedError")
+_RADIO_OFFSET_SHIFT = rebasing.Q_OFFSET - binary_exponent(ATO_RADIO, "Offset")
+_RADIO_OFFSET_SPEED_SHIFT = rebasing.Q_OFFSET_SPEED - binary_exponent(ATO_RADIO, "OffsetSpeed")
 # A hundredth has no exact Q24: 14 more bits keep the limit within an LSB.
 _PERMITTED_FACTOR = round(ATP_LIMIT.PermittedSpeed.scale * 2 ** (Q_SPEED + 14))
 
@@ -105,7 +127,8 @@ CORE_STATE = np.dtype(
         ("quality", np.int32),
         ("map_section", np.int32),  # of the gradient map
         ("car_force", np.int32, (distribution.CARS_MAX,)),  # N Q4
-        ("sent", np.int32, (MESSAGE_COUNT,)),  # next end-to-end counter of each message sent
+        # Next end-to-end counter of each message sent; an even number, so that nothing is padded.
+        ("sent", np.int32, (MESSAGE_COUNT + MESSAGE_COUNT % 2,)),
     ],
     align=True,
 )
@@ -119,6 +142,8 @@ def params_dtype(law_params: np.dtype) -> np.dtype:
             ("guard", guard.PARAMS),
             ("reference", reference.REFERENCE_PARAMS),
             ("gradient_map", gradient_map.PARAMS),
+            ("neighbours", neighbours.PARAMS),
+            ("rebasing", rebasing.PARAMS),
             ("memory", memory.MEMORY_PARAMS),
             ("distribution", distribution.PARAMS),
             ("law", law_params),
@@ -135,6 +160,8 @@ def state_dtype(law_state: np.dtype) -> np.dtype:
             ("links", LINK, (MESSAGE_COUNT,)),
             ("cursor", reference.CURSOR),
             ("ahead", reference.CURSOR),
+            ("neighbours", neighbours.STATE),
+            ("rebasing", rebasing.STATE),
             ("memory", memory.MEMORY_STATE),
             ("cell", memory.CELL),
             ("inputs", INPUTS),
@@ -196,6 +223,8 @@ def begin(params: Any, profile: Any, state: Any, cells: Any) -> None:
     for i in range(reference.PREVIEW_MAX):
         if i < int64(params.reference.preview):
             reference.advance(params.reference, state.ahead, profile)
+    neighbours.begin(state.neighbours)
+    rebasing.begin(state.rebasing)
     memory.rewind(params.memory, state.memory, cells, state.cell)
     state.inputs.limited = 0
 
@@ -252,12 +281,69 @@ def read_inputs(state: Any, rx: Any) -> None:
 def read_reference(params: Any, state: Any) -> None:
     """The onboard reference now and `preview` ticks ahead."""
     inputs = state.inputs
-    inputs.reference_position = reference.position(state.cursor)
+    start = int64(params.neighbours.start)
+    inputs.reference_position = sat32(reference.position(state.cursor) + start)
     inputs.reference_speed = reference.speed(params.reference, state.cursor)
     inputs.reference_acceleration = reference.acceleration(params.reference, state.cursor)
-    inputs.ahead_position = reference.position(state.ahead)
+    inputs.ahead_position = sat32(reference.position(state.ahead) + start)
     inputs.ahead_speed = reference.speed(params.reference, state.ahead)
     inputs.ahead_acceleration = reference.acceleration(params.reference, state.ahead)
+
+
+@step
+def read_neighbour(params: Any, state: Any, rx: Any, side: Any, position: Any, motion: Any) -> None:
+    """The two frames of a neighbour, if both of this tick pass their check."""
+    passed = receive(state.links[position.index], rx[position.index], position.data_id)
+    passed &= receive(state.links[motion.index], rx[motion.index], motion.data_id)
+    if passed != 0 and int64(params.neighbours.exists[side]) != 0:
+        neighbours.accept(
+            params.neighbours,
+            state.neighbours,
+            side,
+            int64(state.core.tick),
+            position,
+            int64(rx[position.index].payload),
+            motion,
+            int64(rx[motion.index].payload),
+        )
+
+
+@step
+def read_line(params: Any, state: Any, rx: Any) -> Any:
+    """The neighbours as they are now, and the reference that the train follows because of them;
+    fault bits."""
+    core = state.core
+    inputs = state.inputs
+    around = state.neighbours
+    neighbours.remember(around, inputs)
+    read_neighbour(params, state, rx, AHEAD, NEIGHBOUR_AHEAD_POSITION, NEIGHBOUR_AHEAD_MOTION)
+    read_neighbour(params, state, rx, BEHIND, NEIGHBOUR_BEHIND_POSITION, NEIGHBOUR_BEHIND_MOTION)
+    faults = int64(0)
+    if neighbours.project(params.neighbours, around, inputs) != 0:
+        faults |= FAULT_NEIGHBOUR_LOST
+    state.rebasing.braking = 1 if int64(core.guard) >= GUARD_SERVICE_BRAKE else 0
+    rebasing.follow(params.rebasing, state.rebasing, around.side, inputs)
+    if int64(state.rebasing.latched) != 0:
+        faults |= FAULT_REBASED
+    if rebasing.emergency(state.rebasing, around.side) != 0:
+        faults |= FAULT_LINE_EMERGENCY
+    return faults
+
+
+@step
+def radio_word(state: Any) -> Any:
+    """ATO_RADIO."""
+    own = state.rebasing
+    sides = state.neighbours.side
+    offset = saturate(ATO_RADIO.Offset, round_shift(int64(own.offset), _RADIO_OFFSET_SHIFT))
+    speed = round_shift(int64(own.offset_speed), _RADIO_OFFSET_SPEED_SHIFT)
+    return (
+        put(ATO_RADIO.OffsetSpeed, saturate(ATO_RADIO.OffsetSpeed, speed))
+        + put(ATO_RADIO.Rebased, int64(own.latched))
+        + put(ATO_RADIO.EmergencyBrakeToRear, rebasing.emergency_to_rear(own, sides))
+        + put(ATO_RADIO.EmergencyBrakeToFront, rebasing.emergency_to_front(own, sides))
+        + put(ATO_RADIO.Offset, offset)
+    )
 
 
 @step
@@ -327,13 +413,16 @@ def build_tick(law_step: Any) -> Any:
     """
 
     @step
-    def run_tick(params: Any, profile: Any, state: Any, cells: Any, tx: Any) -> None:
+    def run_tick(params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any) -> None:
         core = state.core
         inputs = state.inputs
-        read_reference(params, state)
-        read_map(params, state)
         inputs.tick = core.tick
         inputs.iteration = core.iteration
+        read_reference(params, state)
+        has_neighbours = neighbours.any_exist(params.neighbours) != 0
+        if has_neighbours:
+            core.faults = int64(core.faults) | read_line(params, state, rx)
+        read_map(params, state)
 
         memory.gather(params.memory, state.memory, cells, state.cell)
         law_step(params.law, state.law, state.cell, inputs, state.outputs)
@@ -384,6 +473,8 @@ def build_tick(law_step: Any) -> Any:
                     int64(state.outputs.estimate[phase]),
                 ),
             )
+        if has_neighbours and phase == 0:
+            send(core, tx, ATO_RADIO, radio_word(state))
         mode = int64(COAST)
         if force > 0:
             mode = int64(TRACTION)
@@ -424,6 +515,6 @@ def build_tick(law_step: Any) -> Any:
                 send(core, tx, ATO_STATUS, status_word(params, core))
         if int64(core.run_state) == RUNNING and period == 1:
             read_inputs(state, rx)
-            run_tick(params, profile, state, cells, tx)
+            run_tick(params, profile, state, cells, rx, tx)
 
     return tick

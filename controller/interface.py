@@ -6,6 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 ESTIMATES_MAX = 10
+SIDES = 2  # neighbours of a train: the one ahead, the one behind
+AHEAD, BEHIND = 0, 1
 
 # Inputs of a law in one tick. Ahead: `preview` ticks later than now.
 INPUTS = np.dtype(
@@ -22,6 +24,10 @@ INPUTS = np.dtype(
         ("ahead_acceleration", np.int32),  # m/s^2, Q27
         ("limited", np.int32),  # 1: the command of the last tick was limited on its way out
         ("map_acceleration", np.int32),  # resistance of the track by the gradient map, m/s^2, Q27
+        # Of the trains ahead and behind, brought to this tick.
+        ("neighbour", np.int32, (SIDES,)),  # 1: the law cooperates with it
+        ("distance", np.int32, (SIDES,)),  # own position minus its position, m, Q15
+        ("closing", np.int32, (SIDES,)),  # its speed minus own speed, m/s, Q24
     ],
     align=True,
 )
@@ -59,6 +65,9 @@ FAULT_OVERSPEED = 1 << 5  # measured speed above the permitted speed
 FAULT_ATP = 1 << 6  # ATP demands a brake
 FAULT_TICK = 1 << 7  # the plant's tick jumped
 FAULT_BARRIER = 1 << 8  # the law left the region that its barrier guards
+FAULT_NEIGHBOUR_LOST = 1 << 9  # nothing new from a neighbour for too long
+FAULT_REBASED = 1 << 10  # the train has left its timetable for a re-based one
+FAULT_LINE_EMERGENCY = 1 << 11  # a train of the line brakes in an emergency
 
 FAULTS: dict[int, str] = {
     FAULT_SPEED_LOST: "speed lost",
@@ -70,6 +79,9 @@ FAULTS: dict[int, str] = {
     FAULT_ATP: "ATP brake demand",
     FAULT_TICK: "tick jumped",
     FAULT_BARRIER: "barrier reached",
+    FAULT_NEIGHBOUR_LOST: "neighbour lost",
+    FAULT_REBASED: "timetable re-based",
+    FAULT_LINE_EMERGENCY: "emergency brake on the line",
 }
 
 # A run with one of these leaves no trace in the learning memory. A law that reaches its barrier or

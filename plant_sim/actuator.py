@@ -83,6 +83,15 @@ def reset(state: Any) -> None:
 
 
 @step
+def preset(state: Any, channel: Any, force_n: Any) -> None:
+    """A force that was commanded long ago."""
+    state.target[channel] = force_n
+    state.actual[channel] = force_n
+    for slot in range(DELAY_MAX):
+        state.queue[slot, channel] = force_n
+
+
+@step
 def command(params: Any, state: Any, channel: Any, force_n: Any) -> None:
     """A new command, once a control period, for a train with one actuator; `shift` follows."""
     head = int64(state.head)

@@ -1,9 +1,9 @@
 """The plant as a node: sensors and ATP to frames, frames to actuators, one control period at a
 time.
 
-`sense` writes the frames of tick k, `actuate_and_advance` takes the answers and moves the train to
+`sense` writes the frames of tick k, `actuate_and_advance` takes the answers and moves the trains to
 tick k + 1. Both are steps: the plant process (HIL) and the single-process loop (SIL) run the same
-code and send the same bits.
+code and send the same bits. Every train has mailboxes of its own; a single train is a line of one.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc import e2e
 from can_dbc.codec import (
     ATO_STATUS,
     ATP_LIMIT,
@@ -25,18 +24,21 @@ from can_dbc.codec import (
     RUN_CTRL,
     TRAIN_POSITION,
     TRAIN_SPEED,
+    choices,
     get,
     put,
     saturate,
 )
 from can_dbc.step import int64, step
-from plant_sim import actuator
+from plant_sim import actuator, radio
+from plant_sim.mail import received, send
 
 IDLE, ARMED, RUNNING, ENDED = 0, 1, 2, 3
 CONTROL_PERIOD_TICKS = 10  # RUN_CTRL comes every so many ticks
 NO_TARGET_M = 65535
 TICK_MASK = 0xFFFF
 CARS_MAX = 8
+EMERGENCY_BRAKE = choices("ATP_LIMIT", "Supervision")["emergency_brake"]
 
 LIMIT = np.dtype(
     [
@@ -60,8 +62,16 @@ TRUTH = np.dtype(
     ]
 )
 
-# Random numbers of one tick, drawn by the host: noise of unit variance, disturbance in m/s^2.
-CHANCE = np.dtype([("speed_noise", np.float64), ("disturbance_m_s2", np.float64)])
+# Random numbers of one tick, drawn by the host: noise of unit variance, disturbance in m/s^2, and
+# whether the radio loses what would arrive in this tick (0 or 1).
+CHANCE = np.dtype(
+    [
+        ("speed_noise", np.float64),
+        ("disturbance_m_s2", np.float64),
+        ("lost_ahead", np.int64),
+        ("lost_behind", np.int64),
+    ]
+)
 
 NODE_PARAMS = np.dtype(
     [
@@ -73,6 +83,15 @@ NODE_PARAMS = np.dtype(
         ("rear_weight", np.float64),  # 0: sensor at the front, 0.5: mean of front and rear
         ("rear_offset_m", np.float64),  # distance of front and rear at rest
         ("recuperation", np.float64),  # part of the braking work that comes back
+        ("mass_kg", np.float64),
+        ("holding_force_n", np.float64),  # of the actuators when a run begins
+        ("weak_from", np.int64),  # first tick of lost traction
+        ("weak_to", np.int64),  # first tick after it
+        ("weak_force_n", np.float64),  # largest traction that is left
+        ("brake_from", np.int64),  # the same of a brake that nobody commanded
+        ("brake_to", np.int64),
+        ("brake_m_s2", np.float64),  # deceleration that it holds
+        ("brake_supervision", np.int64),  # what ATP says meanwhile
     ],
     align=True,
 )
@@ -100,38 +119,27 @@ NODE_STATE = np.dtype(
 def params_dtype(train_params: np.dtype) -> np.dtype:
     """PARAMS of the plant around those of a train model."""
     return np.dtype(
-        [("node", NODE_PARAMS), ("actuator", actuator.PARAMS), ("train", train_params)], align=True
+        [
+            ("node", NODE_PARAMS),
+            ("radio", radio.PARAMS),
+            ("actuator", actuator.PARAMS),
+            ("train", train_params),
+        ],
+        align=True,
     )
 
 
 def state_dtype(train_state: np.dtype) -> np.dtype:
     """STATE of the plant around that of a train model."""
     return np.dtype(
-        [("node", NODE_STATE), ("actuator", actuator.STATE), ("train", train_state)], align=True
+        [
+            ("node", NODE_STATE),
+            ("radio", radio.STATE),
+            ("actuator", actuator.STATE),
+            ("train", train_state),
+        ],
+        align=True,
     )
-
-
-@step
-def send(node: Any, tx: Any, message: Any, word: Any) -> None:
-    """Protects `word` and puts it into the message's mailbox."""
-    counter = int64(node.sent[message.index])
-    node.sent[message.index] = e2e.next_counter(counter)
-    tx[message.index].payload = e2e.protect(word, counter, message.data_id)
-    tx[message.index].fresh = 1
-
-
-@step
-def received(node: Any, rx: Any, message: Any) -> Any:
-    """1 if the mailbox holds a new frame that passes the end-to-end check."""
-    if int64(rx[message.index].fresh) == 0:
-        return int64(0)
-    word = int64(rx[message.index].payload)
-    found = e2e.check(word, int64(node.received[message.index]), message.data_id)
-    if found == e2e.CORRUPT or found == e2e.REPEATED:
-        node.refused += 1
-        return int64(0)
-    node.received[message.index] = (word >> 8) & 15
-    return int64(1)
 
 
 @step
@@ -218,18 +226,40 @@ def read_commands(params: Any, node: Any, rx: Any) -> None:
 
 
 @step
+def fail(params: Any, node: Any, train: Any) -> None:
+    """What the scenario's faults make of the command: less traction, or a brake."""
+    tick = int64(node.tick)
+    if tick >= params.weak_from and tick < params.weak_to:
+        node.command_n[0] = min(node.command_n[0], params.weak_force_n)
+    if tick >= params.brake_from and tick < params.brake_to:
+        force = -params.mass_kg * params.brake_m_s2
+        if train.speed_m_s > 0.0:  # the train's resistance brakes as well
+            force += train.force_n - params.mass_kg * train.acceleration_m_s2
+        node.command_n[0] = force
+
+
+@step
+def supervision(params: Any, tick: Any) -> Any:
+    """What ATP demands."""
+    if tick >= params.brake_from and tick < params.brake_to:
+        return int64(params.brake_supervision)
+    return int64(0)
+
+
+@step
 def no_coupler_force_n(train: Any) -> Any:
     """Of a model without couplers."""
     return 0.0
 
 
 def build(model: Any) -> tuple[Any, Any, Any]:
-    """Steps around one train model: `begin(params, state)`, `sense(params, limits, state, chance,
-    tx)` and `actuate_and_advance(params, track, state, chance, rx, truth)`.
+    """Steps around one train model, for all trains of the line: `begin(params, state)`,
+    `sense(params, limits, state, chance, tick, tx)` and `actuate_and_advance(params, track, state,
+    chance, tick, rx, truth)`.
 
-    Shapes: params, state one record of `params_dtype`/`state_dtype`; limits [n] of LIMIT; track
-    [n] of track.SECTION; chance, truth one record of CHANCE, TRUTH of this tick; rx, tx
-    [MESSAGE_COUNT] of codec.MAILBOX.
+    Shapes: params, state [trains] of `params_dtype`/`state_dtype`; limits [n] of LIMIT; track [n]
+    of track.SECTION; chance, truth [trains, ticks] of CHANCE, TRUTH; rx, tx [trains, MESSAGE_COUNT]
+    of codec.MAILBOX.
     """
     reset_train = model.reset
     advance_train = model.advance
@@ -237,13 +267,15 @@ def build(model: Any) -> tuple[Any, Any, Any]:
     coupler_force_n = getattr(model, "coupler_force_n", no_coupler_force_n)
 
     @step
-    def begin(params: Any, state: Any) -> None:
+    def begin_train(params: Any, state: Any) -> None:
         begin_node(state.node)
+        radio.reset(state.radio)
         actuator.reset(state.actuator)
+        actuator.preset(state.actuator, int64(0), params.node.holding_force_n)
         reset_train(params.train, state.train)
 
     @step
-    def sense(params: Any, limits: Any, state: Any, chance: Any, tx: Any) -> None:
+    def sense_train(params: Any, limits: Any, state: Any, chance: Any, tx: Any) -> None:
         node = state.node
         train = state.train
         setting = params.node
@@ -260,7 +292,8 @@ def build(model: Any) -> tuple[Any, Any, Any]:
             ATP_LIMIT,
             put(ATP_LIMIT.PermittedSpeed, permitted)
             + put(ATP_LIMIT.TargetSpeed, permitted)
-            + put(ATP_LIMIT.TargetDistance, int64(NO_TARGET_M)),
+            + put(ATP_LIMIT.TargetDistance, int64(NO_TARGET_M))
+            + put(ATP_LIMIT.Supervision, supervision(setting, tick)),
         )
         rear = setting.rear_weight
         position = train.position_m + rear * (
@@ -288,7 +321,7 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         )
 
     @step
-    def actuate_and_advance(
+    def advance_train_and_actuators(
         params: Any, track: Any, state: Any, chance: Any, rx: Any, truth: Any
     ) -> None:
         node = state.node
@@ -301,6 +334,8 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         truth.braking_j = train.braking_j
         truth.recuperated_j = params.node.recuperation * train.braking_j
         read_commands(params.node, node, rx)
+        radio.read(node, state.radio, rx)
+        fail(params.node, node, train)
         command_train(params, state)
         actuator.shift(state.actuator)
         advance_train(
@@ -314,5 +349,31 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         truth.force_n = train.force_n
         truth.coupler_force_n = coupler_force_n(train)
         node.tick += 1
+
+    @step
+    def begin(params: Any, state: Any) -> None:
+        for train in range(len(state)):
+            begin_train(params[train], state[train])
+
+    @step
+    def sense(params: Any, limits: Any, state: Any, chance: Any, tick: Any, tx: Any) -> None:
+        for train in range(len(state)):
+            sense_train(params[train], limits, state[train], chance[train, tick], tx[train])
+        if len(state) > 1:
+            radio.exchange(params, state, chance, tick, tx)
+
+    @step
+    def actuate_and_advance(
+        params: Any, track: Any, state: Any, chance: Any, tick: Any, rx: Any, truth: Any
+    ) -> None:
+        for train in range(len(state)):
+            advance_train_and_actuators(
+                params[train],
+                track,
+                state[train],
+                chance[train, tick],
+                rx[train],
+                truth[train, tick],
+            )
 
     return begin, sense, actuate_and_advance

@@ -15,7 +15,7 @@ without any loss, so firmware, plant and reports agree to the bit. The profile s
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,17 @@ def evaluate(segments: NDArray[np.void], period_s: float) -> Profile:
         position_q15=position_q15,
         speed_q24=speed_q24,
         acceleration_q27=acceleration_q27,
+    )
+
+
+def displaced(profile: Profile, distance_m: float) -> Profile:
+    """The profile with its start at `distance_m` instead of 0.
+
+    Raises ValueError if it then leaves the firmware's range.
+    """
+    x = profile.x + round(distance_m / POSITION_UNIT_M)
+    return replace(
+        profile, x=x, position_m=_to_si(x, 1), position_q15=_to_int32(x, 1, 25, "position")
     )
 
 

@@ -22,8 +22,9 @@ import msgspec
 import numpy as np
 
 from plant_sim.actuator import Actuator
+from plant_sim.line import Line
 from plant_sim.planner import PlanError, ProfilePlan, plan_profile
-from plant_sim.profile import Profile, evaluate
+from plant_sim.profile import Profile, displaced, evaluate
 from plant_sim.track import Track
 from plant_sim.trains import couplers, lumped, point
 
@@ -106,6 +107,8 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     map_share: Share = 0.0  # part of the resistance of the track that the onboard map has
     memory: dict[str, Any] = {}
     guard: dict[str, Any] = {}
+    neighbours: dict[str, Any] = {}  # of a line
+    rebasing: dict[str, Any] | None = None  # of a line; none: its trains keep their timetables
 
 
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -125,12 +128,14 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     run_length: RunLength | None = None  # none: every run lasts as long as the profile
     control: Control = Control()
     metrics: Metrics = Metrics()
+    line: Line | None = None  # several trains; none: one
     tuning: dict[str, str] = {}  # how the gains of each law were found, for who compares them
     base: str = ""
 
 
 class Loaded(msgspec.Struct, frozen=True):
-    """A scenario with what follows from it."""
+    """A scenario with what follows from it: of the line's first train, or as `member` gives it, of
+    another."""
 
     name: str  # with its case, as `load` takes it
     path: Path
@@ -139,7 +144,8 @@ class Loaded(msgspec.Struct, frozen=True):
     digest: str  # of the merged content
     scenario: Scenario
     segments: np.ndarray  # profile.SEGMENT
-    profile: Profile
+    profile: Profile  # of this train
+    train: int = 0  # place on the line, 0 leads
 
     @property
     def folder_name(self) -> str:
@@ -156,6 +162,16 @@ class Loaded(msgspec.Struct, frozen=True):
     def ticks(self) -> int:
         """Control periods of a whole run."""
         return len(self.profile.x)
+
+    @property
+    def trains(self) -> int:
+        """How many trains the scenario has."""
+        return self.scenario.line.trains if self.scenario.line else 1
+
+    @property
+    def start_m(self) -> float:
+        """Where this train's reference starts."""
+        return -self.train * self.scenario.line.spacing_m if self.scenario.line else 0.0
 
 
 def scenario_names() -> list[str]:
@@ -278,7 +294,7 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
     except (PlanError, ValueError) as error:
         raise ScenarioError(f"{_place(path, case)}: [profile]: {error}") from None
     digest = hashlib.blake2b(msgspec.json.encode(content, order="deterministic"), digest_size=16)
-    return Loaded(
+    loaded = Loaded(
         f"{path.stem}:{case}" if case else path.stem,
         path,
         case,
@@ -288,11 +304,56 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
         segments,
         profile,
     )
+    if scenario.line:
+        members(loaded)  # so that a wrong one is refused here
+    return loaded
 
 
 def _place(path: Path, case: str) -> str:
     """Where a scenario's content is from, for messages."""
     return f"{path}, case {case}" if case else str(path)
+
+
+def members(loaded: Loaded) -> list[Loaded]:
+    """The scenario of each train of the line, the leader's first; of a single train, its own."""
+    return [member(loaded, train) for train in range(loaded.trains)]
+
+
+def member(loaded: Loaded, train: int) -> Loaded:
+    """The scenario of train `train` (0 leads) of a loaded line: its own numbers, its reference.
+
+    Raises ScenarioError if what the line says of the train is wrong.
+    """
+    line = loaded.scenario.line
+    if line is None:
+        return loaded
+    assert loaded.train == 0
+    scenario = _own_numbers(loaded, line, train) if line.members else loaded.scenario
+    assert isinstance(scenario.train, point.Train)
+    start_m = -train * line.spacing_m
+    own_train = msgspec.structs.replace(scenario.train, start_m=scenario.train.start_m + start_m)
+    return msgspec.structs.replace(
+        loaded,
+        scenario=msgspec.structs.replace(scenario, train=own_train),
+        profile=displaced(loaded.profile, start_m),
+        train=train,
+    )
+
+
+def _own_numbers(loaded: Loaded, line: Line, train: int) -> Scenario:
+    """The scenario with what the line says of one train on top."""
+    which = train % len(line.members)
+    own = line.members[which]
+    where = f"{_place(loaded.path, loaded.case)}: key line.members[{which}]"
+    unknown = set(own.laws) - set(loaded.scenario.laws)
+    if unknown:
+        known = ", ".join(loaded.scenario.laws)
+        raise ScenarioError(f"{where}.laws.{unknown.pop()}: expected one of {known}")
+    content = _merged(msgspec.to_builtins(loaded.scenario), msgspec.to_builtins(own))
+    try:
+        return msgspec.convert(content, Scenario)
+    except msgspec.ValidationError as error:
+        raise ScenarioError(f"{where}: {_where(str(error))}") from None
 
 
 def _where(message: str) -> str:
@@ -326,5 +387,7 @@ def _check(path: str, scenario: Scenario) -> None:
         key = "interpolation" if scenario.track.interpolation != "hold" else "averaged_over_m"
         model = "only train model 'point' takes such a track"
         raise ScenarioError(f"{path}: key track.{key}: {model}")
+    if scenario.line and not isinstance(scenario.train, point.Train):
+        raise ScenarioError(f"{path}: key train.model: a line has trains of model 'point'")
     if not scenario.profile.limits and scenario.profile.limit_above_m_s is None:
         raise ScenarioError(f"{path}: key profile.limits: expected at least one limit")

@@ -11,33 +11,40 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.codec import mailboxes
-from can_dbc.step import INTERPRETED, step
+from can_dbc.codec import MAILBOX, MESSAGE_COUNT, NEIGHBOUR_AHEAD_POSITION
+from can_dbc.step import INTERPRETED
 from plant_sim import actuator, plant, track
-from plant_sim.scenario import MODELS, Loaded
+from plant_sim.line import Fault
+from plant_sim.scenario import MODELS, Loaded, Scenario, members
+from plant_sim.trains import point
+from plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
-# Chance: what a random number is drawn for; each gets a stream of its own.
-SPEED_NOISE, DISTURBANCE, RUN_LENGTH = 0, 1, 2
+# Chance: what a random number is drawn for; each gets a stream of its own, in each train.
+SPEED_NOISE, DISTURBANCE, LOST_AHEAD, LOST_BEHIND = 0, 1, 2, 3
+STREAMS = 4  # of a train
+RUN_LENGTH = LOST_AHEAD  # of a run: the leader has no train ahead whose packets are lost
+NEVER = 2**62  # tick
 
 
 @dataclass
 class World:
-    """Buffers of one plant."""
+    """Buffers of one plant with all its trains."""
 
-    loaded: Loaded
+    members: list[Loaded]  # the scenario of each train
     seed: int
-    steps: tuple[Any, Any, Any]  # of plant.build, for loops that are compiled around them
-    begin: (
-        Any  # the same for Python: params and state as arrays of one record, the tick as an index
-    )
+    begin: Any  # steps of plant.build
     sense: Any
     actuate_and_advance: Any
-    params: Any  # (1,)
-    state: Any  # (1,)
+    params: Any  # [trains]
+    state: Any  # [trains]
     limits: Any  # [n] of plant.LIMIT
     track: Any  # [n] of track.SECTION
-    rx: Any  # mailboxes
+    rx: Any  # [trains, MESSAGE_COUNT] mailboxes
     tx: Any
+
+    def ticks(self, run: int) -> int:
+        """Control periods of a run."""
+        return run_ticks(self.members[0], self.seed, run)
 
 
 def rows(array: np.ndarray) -> Any:
@@ -45,34 +52,35 @@ def rows(array: np.ndarray) -> Any:
     return array.view(np.recarray) if INTERPRETED else array
 
 
-def callable_steps(
-    begin_step: Any, sense_step: Any, actuate_and_advance_step: Any
-) -> tuple[Any, Any, Any]:
-    """The plant's steps for Python. Arrays are ten times cheaper to pass than records: a record is
-    described field by field."""
-
-    @step
-    def begin(params: Any, state: Any) -> None:
-        begin_step(params[0], state[0])
-
-    @step
-    def sense(params: Any, limits: Any, state: Any, chance: Any, tick: Any, tx: Any) -> None:
-        sense_step(params[0], limits, state[0], chance[tick], tx)
-
-    @step
-    def actuate_and_advance(
-        params: Any, track: Any, state: Any, chance: Any, tick: Any, rx: Any, truth: Any
-    ) -> None:
-        actuate_and_advance_step(params[0], track, state[0], chance[tick], rx, truth[tick])
-
-    return begin, sense, actuate_and_advance
-
-
 def build(loaded: Loaded, seed: int) -> World:
-    """The plant of a scenario."""
+    """The plant of a scenario, with all its trains."""
+    scenario = loaded.scenario
+    model = MODELS[type(scenario.train)]
+    trains = members(loaded)
+    begin, sense, actuate_and_advance = plant.build(model)
+    params = np.zeros(len(trains), plant.params_dtype(model.PARAMS))
+    for train in trains:
+        params[train.train] = _params(train, model)[0]
+    boxes = (len(trains), MESSAGE_COUNT)
+    return World(
+        members=trains,
+        seed=seed,
+        begin=begin,
+        sense=sense,
+        actuate_and_advance=actuate_and_advance,
+        params=rows(params),
+        state=rows(np.zeros(len(trains), plant.state_dtype(model.STATE))),
+        limits=rows(limits_of(loaded)),
+        track=rows(track.sections(scenario.track)),
+        rx=rows(np.zeros(boxes, MAILBOX)),
+        tx=rows(np.zeros(boxes, MAILBOX)),
+    )
+
+
+def _params(loaded: Loaded, model: Any) -> np.ndarray:
+    """PARAMS of one train, shape (1,)."""
     scenario = loaded.scenario
     train = scenario.train
-    model = MODELS[type(train)]
     smeared = scenario.track.application == "smeared"
     params = np.zeros(1, plant.params_dtype(model.PARAMS))
     params["train"] = model.calibrate(train, scenario.period_s, smeared)
@@ -80,6 +88,7 @@ def build(loaded: Loaded, seed: int) -> World:
         scenario.actuator, train.mass_kg, scenario.period_s, scenario.period_s / train.substeps
     )
     node = params["node"]
+    node["mass_kg"] = train.mass_kg
     cars = len(train.effectiveness)
     node["cars"] = cars if scenario.control.distribute else 0
     node["effectiveness"][0, :cars] = train.effectiveness
@@ -89,24 +98,33 @@ def build(loaded: Loaded, seed: int) -> World:
     node["rear_weight"] = 0.5 if scenario.sensors.location == "mean" else 0.0
     node["rear_offset_m"] = train.rear_offset_m
     node["recuperation"] = scenario.actuator.recuperation_efficiency
+    if isinstance(train, point.Train) and train.held_at_start:
+        sections = rows(track.sections(scenario.track))
+        here = track.section_at(sections, train.start_m, 0)
+        grade = GRAVITY_M_S2 * N_PER_KN * track.resistance_at(sections, here, train.start_m)
+        node["holding_force_n"] = train.mass_kg * (train.resistance.constant[0] + grade)
+    if scenario.line:
+        radio = params["radio"]
+        radio["period"] = scenario.line.radio.period_ticks
+        radio["delay"] = scenario.line.radio.delay_ticks
+        radio["age_factor"] = scenario.period_s / NEIGHBOUR_AHEAD_POSITION.Age.scale
+        for fault in scenario.line.faults:
+            if fault.train == loaded.train + 1:
+                _fail(node, fault, scenario)
+    return params
 
-    state = np.zeros(1, plant.state_dtype(model.STATE))
-    steps = plant.build(model)
-    begin, sense, actuate_and_advance = callable_steps(*steps)
-    return World(
-        loaded=loaded,
-        seed=seed,
-        steps=steps,
-        begin=begin,
-        sense=sense,
-        actuate_and_advance=actuate_and_advance,
-        params=rows(params),
-        state=rows(state),
-        limits=rows(limits_of(loaded)),
-        track=rows(track.sections(scenario.track)),
-        rx=rows(mailboxes()),
-        tx=rows(mailboxes()),
-    )
+
+def _fail(node: np.ndarray, fault: Fault, scenario: Scenario) -> None:
+    """A fault of a train as NODE_PARAMS."""
+    kind = "brake" if fault.traction_share is None else "weak"
+    node[f"{kind}_from"] = round(fault.from_s / scenario.period_s)
+    node[f"{kind}_to"] = round(min(fault.to_s / scenario.period_s, NEVER))
+    if fault.traction_share is not None:
+        largest_n = scenario.actuator.force_max_m_s2 * scenario.train.mass_kg
+        node["weak_force_n"] = fault.traction_share * largest_n
+    else:
+        node["brake_m_s2"] = fault.brake_m_s2
+        node["brake_supervision"] = plant.EMERGENCY_BRAKE if fault.emergency else 0
 
 
 def limits_of(loaded: Loaded) -> np.ndarray:
@@ -151,21 +169,39 @@ def _uniform(words: np.ndarray) -> np.ndarray:
     return (words >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
+def chances(here: World, run: int) -> Any:
+    """Random numbers of a run, [trains, ticks] of plant.CHANCE, for the steps."""
+    return rows(np.stack([chance(train, here.seed, run) for train in here.members]))
+
+
 def chance(loaded: Loaded, seed: int, run: int) -> np.ndarray:
-    """Random numbers of a run, [run_ticks] of plant.CHANCE; only what the scenario uses is drawn.
+    """Random numbers of a train in a run, [run_ticks] of plant.CHANCE; only what the scenario uses
+    is drawn.
 
     A tick's number does not depend on when the run ends.
     """
     ticks = run_ticks(loaded, seed, run)
+    first = STREAMS * loaded.train
     drawn = np.zeros(ticks, plant.CHANCE)
     if loaded.scenario.sensors.speed_noise_m_s > 0:
         # Sum of twelve uniforms: variance 1, no logarithm whose last bit depends on the machine.
-        words = _bits(seed, run, SPEED_NOISE, 12 * ticks).reshape(ticks, 12)
+        words = _bits(seed, run, first + SPEED_NOISE, 12 * ticks).reshape(ticks, 12)
         drawn["speed_noise"] = _uniform(words).sum(axis=1) - 6.0
     disturbance = loaded.scenario.disturbance
     if disturbance.amplitude_m_s2 > 0:
         values = -(-ticks // disturbance.hold_ticks)
-        uniform = _uniform(_bits(seed, run, DISTURBANCE, values))
+        uniform = _uniform(_bits(seed, run, first + DISTURBANCE, values))
         held = np.repeat(2.0 * uniform - 1.0, disturbance.hold_ticks)[:ticks]
         drawn["disturbance_m_s2"] = disturbance.amplitude_m_s2 * held
+    if loaded.scenario.line:
+        radio = loaded.scenario.line.radio
+        for name, stream in (("lost_ahead", LOST_AHEAD), ("lost_behind", LOST_BEHIND)):
+            if radio.loss > 0:
+                drawn[name] = _uniform(_bits(seed, run, first + stream, ticks)) < radio.loss
+            for outage in radio.outages:
+                first_tick, end = (
+                    round(min(at_s / loaded.scenario.period_s, ticks))
+                    for at_s in (outage.from_s, outage.to_s)
+                )
+                drawn[name][first_tick:end] = 1
     return drawn

@@ -18,7 +18,7 @@ import numpy as np
 
 from can_dbc.codec import MESSAGES, TRAIN_POSITION, database
 from can_dbc.timing import Stream, frame_bits, response_time
-from plant_sim.scenario import Loaded
+from plant_sim.scenario import Loaded, members
 from tools import setup, sil
 from tools.verify.identity import shortened
 
@@ -140,11 +140,12 @@ def report(loaded: Loaded, law: str, bitrate: int) -> Report:
 
 
 def traffic(loaded: Loaded, law: str) -> list[Traffic]:
-    """What the nodes send, the most urgent message first, measured in one process (SIL)."""
-    calibration = setup.calibration_for(loaded, law)
+    """What the nodes send, the most urgent message first, measured in one process (SIL); of a line,
+    on the bus that carries most."""
     window = shortened(loaded, MEASURED_TICKS)
-    result, _node = next(sil.run(window, calibration, runs=range(1, 2), seed=1))
-    return list(_traffic(result.frames, window.ticks))
+    nodes = setup.controllers_for(members(window), law)
+    results = next(sil.run_line(window, nodes, runs=range(1, 2), seed=1))
+    return list(_traffic(max((result.frames for result in results), key=len), window.ticks))
 
 
 def _traffic(frames: np.ndarray, ticks: int) -> Iterator[Traffic]:

@@ -72,6 +72,18 @@ COLUMNS = (
     ("ticks/s", "ticks_per_s", 1, "{:,.0f}"),
 )
 
+# The same of a line, whose rows are its trains.
+LINE_COLUMNS = (
+    COLUMNS[0],
+    ("train", "train", 1, "{:d}"),
+    *COLUMNS[2:6],
+    ("least separation\nm", "min_separation_m", 1, "{:.2f}"),
+    ("largest separation\nm", "max_separation_m", 1, "{:.2f}"),
+    ("to the barrier\nmm", "min_barrier_distance_m", 1e3, "{:.1f}"),
+    ("string\namplification", "string_amplification", 1, "{:.3f}"),
+    COLUMNS[7],
+    COLUMNS[-1],
+)
 
 # The columns that do not tell how fast the bench was, and the comfort.
 COMPARED = (*COLUMNS[:-1], ("rms jerk\nm/s³", "rms_command_jerk_m_s3", 1, "{:.3f}"))
@@ -142,10 +154,21 @@ class Screen:
             self.task, completed=(row["run"] - self.runs[0] + 1) * self.ticks, last=last
         )
         if not console.is_terminal:
-            cells = [
-                f"{name.split(chr(10))[0]} {_cell(row, key, f, s)}" for name, key, f, s in COLUMNS
-            ]
-            console.print("  ".join([*cells, _faults(row)]).rstrip(), soft_wrap=True)
+            for shown in _shown(row):
+                cells = [
+                    f"{name.split(chr(10))[0]} {_cell(shown, key, f, s)}"
+                    for name, key, f, s in _columns(row)
+                ]
+                console.print("  ".join([*cells, _faults(shown)]).rstrip(), soft_wrap=True)
+
+
+def _columns(row: dict[str, Any]) -> tuple[tuple[str, str, float, str], ...]:
+    return LINE_COLUMNS if "trains" in row else COLUMNS
+
+
+def _shown(row: dict[str, Any]) -> list[dict[str, Any]]:
+    """The rows of the table for a run: one, or one for each train."""
+    return [{**row, **of_train} for of_train in row.get("trains", [{}])]
 
 
 def _cell(row: dict[str, Any], key: str, factor: float, text: str) -> str:
@@ -163,11 +186,13 @@ def _print_table(screen: Screen) -> None:
     if not screen.rows or not console.is_terminal:
         return
     table = Table(title=screen.title, title_justify="left", header_style="bold")
-    for name, _key, _factor, _text in COLUMNS:
+    columns = _columns(screen.rows[0])
+    for name, _key, _factor, _text in columns:
         table.add_column(name, justify="right")
     table.add_column("faults")
     for row in screen.rows:
-        table.add_row(*(_cell(row, key, f, s) for _n, key, f, s in COLUMNS), _faults(row))
+        for shown in _shown(row):
+            table.add_row(*(_cell(shown, key, f, s) for _n, key, f, s in columns), _faults(shown))
     console.print(table)
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from plant_sim.scenario import Loaded
-from tools import metrics, setup, sil
+from plant_sim.scenario import Loaded, members
+from tools import line, setup, sil
 from tools.trace import TraceWriter
 
 
@@ -24,7 +24,8 @@ def compare(
 
     Raises ScenarioError or LawError for a law that is unknown or has no gains.
     """
-    calibrations = {law: setup.calibration_for(loaded, law) for law in laws}
+    trains = members(loaded)
+    controllers = {law: setup.controllers_for(trains, law) for law in laws}
     writer = TraceWriter(
         trace_file,
         title=f"{loaded.name}: {', '.join(laws)}",
@@ -34,22 +35,26 @@ def compare(
         first_run=1,
         last_run=len(laws),
         names=[law.replace("-", "_") for law in laws],
+        trains=len(trains),
+        spacing_m=loaded.scenario.line.spacing_m if loaded.scenario.line else 0.0,
     )
     rows = []
     try:
         for number, law in enumerate(laws, start=1):
             progress(law)
-            alpha = setup.error_weight(loaded, law)
             numbers = setup.run_numbers(law, runs)
-            for result, _node in sil.run(loaded, calibrations[law], runs=numbers, seed=seed):
-                if result.run not in (1, numbers[-1]):
+            for results in sil.run_line(loaded, controllers[law], runs=numbers, seed=seed):
+                run = results[0].run
+                if run not in (1, numbers[-1]):
                     continue
-                command_n = sil.commanded_force_n(result.frames, len(result.truth))
-                row = metrics.run_metrics(loaded, result.truth, command_n, alpha)
-                rows.append({"law": law, "run": result.run, **row, "faults": result.faults})
-                if result.run == numbers[-1]:
-                    writer.frames(number, result.frames)
-                    writer.truth(number, result.truth)
+                frames, truths = [r.frames for r in results], [r.truth for r in results]
+                row = line.run_row(trains, law, frames, truths)
+                faults = sorted({name for result in results for name in result.faults})
+                rows.append({"law": law, "run": run, **row, "faults": faults})
+                if run == numbers[-1]:
+                    for train, result in enumerate(results):
+                        writer.frames(number, result.frames, train)
+                        writer.truth(number, result.truth, train)
     finally:
         writer.close()
     return rows

@@ -6,7 +6,7 @@ bus: two runs that behaved alike have the same digest, whichever bus carried the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any
 
@@ -51,6 +51,33 @@ class Digest:
     def hex(self) -> str:
         """XXH3-128 of all rows so far, 32 hexadecimal digits."""
         return self._hash.hexdigest()
+
+
+class LineDigest:
+    """The digests of all trains of a line; of a single train, its own."""
+
+    def __init__(self, trains: int) -> None:
+        self._of_trains = [Digest() for _ in range(trains)]
+
+    def update(self, frames: Sequence[np.ndarray]) -> None:
+        """Add FRAME rows of each train."""
+        for digest, of_train in zip(self._of_trains, frames, strict=True):
+            digest.update(of_train)
+
+    def of_trains(self) -> list[str]:
+        """As `Digest.hex`, of each train."""
+        return [digest.hex() for digest in self._of_trains]
+
+    def hex(self) -> str:
+        """One digest that stands for all."""
+        return digest_of_line(self.of_trains())
+
+
+def digest_of_line(digests: Sequence[str]) -> str:
+    """One digest that stands for those of all trains: of a single train, its own."""
+    return (
+        digests[0] if len(digests) == 1 else xxhash.xxh3_128("".join(digests).encode()).hexdigest()
+    )
 
 
 def run_controls(frame_ids: np.ndarray, words: np.ndarray) -> Iterator[tuple[int, int, int]]:

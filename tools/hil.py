@@ -1,6 +1,6 @@
-"""HIL: recorder, controller and plant as processes of their own on one bus; this process starts,
-watches and ends them. A controller or plant that is not ours is started by its owner; an observer
-watches it instead.
+"""HIL: recorder, controllers and plant as processes of their own, on a bus for each train; this
+process starts, watches and ends them. A controller or plant that is not ours is started by its
+owner; an observer watches it instead.
 
 A process that dies, a node that falls silent or Ctrl-C ends the run within two seconds, names the
 cause, keeps the traces so far, and leaves no process and no socket behind.
@@ -124,31 +124,34 @@ class Bench:
     def end(self) -> None:
         """Ends the other nodes, then the recorder, which writes what it has; kills what does not
         end."""
-        for name in (PLANT, CONTROLLER, "observer"):
-            self._end(name, STOP_TIMEOUT_S)
+        driving = [node for node in self.nodes.values() if node.name != "recorder"]
+        for node in driving:
+            if node.process.poll() is None:
+                node.process.terminate()
+        deadline = time.monotonic() + STOP_TIMEOUT_S
+        for node in driving:
+            _wait(node, max(deadline - time.monotonic(), 0.0))
         recorder = self.nodes.get("recorder")
-        if recorder is not None and recorder.process.poll() is None:
-            recorder.command(command="stop")
-        self._end("recorder", 30.0, terminate=False)
+        if recorder is not None:
+            if recorder.process.poll() is None:
+                recorder.command(command="stop")
+            _wait(recorder, 30.0)
         for node in self.nodes.values():
             if node.log.exists() and node.log.stat().st_size == 0:
                 node.log.unlink()
 
-    def _end(self, name: str, timeout_s: float, terminate: bool = True) -> None:
-        node = self.nodes.get(name)
-        if node is None:
-            return
-        if terminate and node.process.poll() is None:
-            node.process.terminate()
-        try:
-            node.process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            node.process.kill()
-            node.process.wait()
-        for stream in (node.process.stdin, node.process.stdout):
-            if stream is not None:
-                with suppress(BrokenPipeError):
-                    stream.close()
+
+def _wait(node: Node, timeout_s: float) -> None:
+    """Until the node has ended; killed after `timeout_s`."""
+    try:
+        node.process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        node.process.kill()
+        node.process.wait()
+    for stream in (node.process.stdin, node.process.stdout):
+        if stream is not None:
+            with suppress(BrokenPipeError):
+                stream.close()
 
 
 def _exit_text(code: int) -> str:
@@ -160,9 +163,9 @@ def _last_line(node: Node) -> str:
     return f": {lines[-1]}" if lines else ""
 
 
-def flash(calibration: Calibration, folder: Path) -> Path:
-    """The calibration as a file for the controller process."""
-    path = folder / "calibration.npz"
+def flash(calibration: Calibration, folder: Path, name: str) -> Path:
+    """The calibration as a file for the controller process called `name`."""
+    path = folder / f"{name}.npz"
     calibrations.save(calibration, path)
     return path
 
@@ -170,8 +173,8 @@ def flash(calibration: Calibration, folder: Path) -> Path:
 def run(
     *,
     scenario: str,
-    calibration: Calibration | None,
-    bus: str,
+    controllers: list[Calibration],
+    buses: list[str],
     runs: range,
     seed: int,
     out: Path,
@@ -183,29 +186,33 @@ def run(
     """Events of the nodes, `ready` of each first, until all runs are done and recorded; see the
     `tell` calls of the processes.
 
-    `calibration` is None where the controller is one of the `external` nodes; `cars` are those
-    that the plant takes a force for, each by itself.
+    `buses` has an entry for each train, and so has `controllers`, or none where the controller is
+    one of the `external` nodes; `cars` are those that the plant takes a force for, each by itself.
 
     Raises RunError with one line if a node dies, falls silent or reports an error.
     """
+    on_buses = [word for bus in buses for word in ("--bus", bus)]
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, Bench(out) as bench:
-        recorder = bench.start("recorder", ["tools.recorder", "--bus", bus, *recorder_arguments])
+        recorder = bench.start("recorder", ["tools.recorder", *on_buses, *recorder_arguments])
         if external:
             watched = [word for name in external for word in ("--external", name)]
             watched += ["--cars", str(cars), "--runs", str(len(runs))]
-            leader = bench.start("observer", ["tools.observer", "--bus", bus, *watched])
-        if calibration is not None:
-            controller_arguments = ["--calibration", str(flash(calibration, Path(scratch)))]
-            if memory_file is not None:
-                controller_arguments += ["--memory", str(memory_file)]
-            bench.start(CONTROLLER, ["controller.process", "--bus", bus, *controller_arguments])
+            leader = bench.start("observer", ["tools.observer", *on_buses, *watched])
         if PLANT not in external:
             plant_arguments = ["--scenario", scenario, "--seed", str(seed), "--out", scratch]
             plant_arguments += ["--first-run", str(runs[0]), "--last-run", str(runs[-1])]
             if CONTROLLER in external:
                 plant_arguments += ["--patience", f"{PATIENCE_S + EXTERNAL_TIMEOUT_S}"]
                 plant_arguments += ["--timeout", f"{EXTERNAL_TIMEOUT_S}"]
-            leader = bench.start(PLANT, ["plant_sim.process", "--bus", bus, *plant_arguments])
+            leader = bench.start(PLANT, ["plant_sim.process", *on_buses, *plant_arguments])
+        for train, calibration in enumerate(controllers):
+            name = CONTROLLER if len(controllers) == 1 else f"{CONTROLLER}-{train + 1}"
+            arguments = ["--calibration", str(flash(calibration, Path(scratch), name))]
+            if memory_file is not None:
+                arguments += ["--memory", str(memory_file)]
+            bench.start(name, ["controller.process", "--bus", buses[train], *arguments])
+            if train == 0:
+                bench.wait_ready()  # what the first controller compiles, the others load
         bench.wait_ready()
         for node in bench.nodes.values():
             yield node, node.said["ready"], bench

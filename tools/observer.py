@@ -10,7 +10,7 @@ It says on stdout, in JSON lines:
     {"event": "ready"}                                     it listens
     {"event": "progress", "run": 1, "tick": …}             of a foreign plant
     {"event": "run", "run": 1, "ticks": …, "seconds": …,   of a foreign plant: a run has ended, and
-     "faults": …}                                          the controller's fault bits
+     "faults": […]}                                        the controller's fault bits
     {"event": "done"}                                      of a foreign plant: all runs have ended
     {"event": "error", "message": "…"}                     a foreign node breaks the rule
 """
@@ -229,7 +229,7 @@ class Observer:
         if PLANT not in self._external:
             return
         seconds = max(self._since_s - self._started_s, 1e-9)
-        tell("run", run=self.run, ticks=self.tick, seconds=seconds, faults=faults)
+        tell("run", run=self.run, ticks=self.tick, seconds=seconds, faults=[faults])
         self.runs_left -= 1
         if self.runs_left == 0:
             tell("done")

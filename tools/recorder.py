@@ -8,9 +8,10 @@ leaves its trace. Internal: `ato-hil run` starts it.
 It says on stdout, in JSON lines:
 
     {"event": "ready"}                                     it listens
-    {"event": "run", "run": 1, "ticks": …, "frames": …,    a run has ended; lost frames by message,
-     "lost": {…}, "dropped": 0, "foreign": 0,              as the bus counted them, frames of other
-     "digest": "…", "complete": true}                      kinds, digest of all runs so far
+    {"event": "run", "run": 1, "ticks": …, "frames": …,    a run has ended on every bus; lost frames
+     "lost": {…}, "dropped": 0, "foreign": 0,              by message, as the buses counted them,
+     "digest": "…", "digests": ["…"],                      frames of other kinds, digest of all runs
+     "complete": true}                                     so far, and that of each train
     {"event": "error", "message": "…"}                     it ends early
 
 and takes on stdin:
@@ -29,6 +30,9 @@ import queue
 import signal
 import sys
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
@@ -42,7 +46,16 @@ from can_dbc.bus import FOREIGN, open_bus, recv_frames
 from can_dbc.child import Stop, follow_parent, tell
 from can_dbc.codec import FORCE_CMD, MESSAGES, RUN_CTRL, decode_column
 from can_dbc.hub_server import ERROR
-from tools.frames import ENDED, FRAME, RUNNING, Digest, columns, run_controls, ticks_of
+from tools.frames import (
+    ENDED,
+    FRAME,
+    RUNNING,
+    Digest,
+    columns,
+    digest_of_line,
+    run_controls,
+    ticks_of,
+)
 from tools.trace import Reference, TraceWriter
 
 BATCH_TICKS = 1000  # of the trace
@@ -55,19 +68,67 @@ DRAIN_S = 1.0  # at the end: longest wait for that
 FIRST_ROWS = 1 << 14
 
 
+def tell_run(event: dict[str, Any]) -> None:
+    """Tells the parent that a run has ended."""
+    tell("run", **event)
+
+
+class RunsOfLine:
+    """Tells the parent that a run has ended when it has on every train's bus."""
+
+    def __init__(self, trains: int) -> None:
+        self._trains = trains
+        self._ended: list[dict[int, dict[str, Any]]] = [{} for _ in range(trains)]
+
+    def ended(self, train: int, event: dict[str, Any]) -> None:
+        """A run has ended on one bus."""
+        self._ended[train][event["run"]] = event
+        if not all(event["run"] in of_train for of_train in self._ended):
+            return
+        events = [of_train.pop(event["run"]) for of_train in self._ended]
+        digests = [each["digest"] for each in events]
+        tell_run(
+            {
+                "run": event["run"],
+                "ticks": min(each["ticks"] for each in events),
+                "frames": sum(each["frames"] for each in events),
+                "lost": {
+                    name if len(events) == 1 else f"{name} of train {number}": count
+                    for number, each in enumerate(events, start=1)
+                    for name, count in each["lost"].items()
+                },
+                "dropped": sum(each["dropped"] for each in events),
+                "foreign": sum(each["foreign"] for each in events),
+                "digest": digest_of_line(digests),
+                "digests": digests,
+                "complete": all(each["complete"] for each in events),
+            }
+        )
+
+
 class Recorder:
     """Keeps the frames of the current run, and tells what each run was."""
 
-    def __init__(self, trace: TraceWriter | None = None, keep_frames: Path | None = None) -> None:
+    def __init__(
+        self,
+        trace: TraceWriter | None = None,
+        keep_frames: Path | None = None,
+        train: int = 0,
+        ended: Callable[[dict[str, Any]], None] = tell_run,
+    ) -> None:
         """Wait for the first run.
 
         :param trace: where frames, truth and summaries are logged.
         :param keep_frames: folder for `frames_RUN.npy`, the FRAME rows of each run.
+        :param train: whose bus this is, 0 leads.
+        :param ended: hears of each run that has ended.
         """
         self.run: int | None = None  # number of the current run
         self.tick = 0  # of the current run
         self._trace = trace
         self._keep_frames = keep_frames
+        self._train = train
+        self._ended = ended
         self._digest = Digest()
         self._rows = np.empty(FIRST_ROWS, FRAME)
         self._count = 0  # of _rows that are this run's
@@ -110,18 +171,20 @@ class Recorder:
         if self._trace is None:
             return
         if command["command"] == "truth":
-            self._trace.truth(command["run"], np.load(command["file"]))
-        else:
+            tables = np.atleast_2d(np.load(command["file"]))  # of all trains
+            self._trace.truth(command["run"], tables[self._train], self._train)
+        elif self._train == 0:
             self._trace.run_summary(command["run"], command["row"])
 
     def finish(self, dropped: int = 0) -> None:
-        """End a run that was cut short, and the trace; `dropped` as in `take`.
+        """End a run that was cut short; `dropped` as in `take`. The leader's also ends the trace,
+        so it comes last.
 
         Raises TraceError if the trace is incomplete.
         """
         if self.run is not None:
             self._end_run(False, dropped)
-        if self._trace is not None:
+        if self._trace is not None and self._train == 0:
             self._trace.close()
 
     def _begin_run(self, number: int) -> None:
@@ -144,7 +207,7 @@ class Recorder:
     def _log(self, end: int) -> None:
         """Bring the trace up to row `end`."""
         if self._trace is not None and self.run is not None:
-            self._trace.frames(self.run, self._rows[self._logged : end])
+            self._trace.frames(self.run, self._rows[self._logged : end], self._train)
         self._logged = end
         self._logged_tick = self.tick
 
@@ -160,19 +223,21 @@ class Recorder:
         if self._trace is not None:
             if lost or dropped_now:
                 text = f"recorder lost frames: {lost}, the bus dropped {dropped_now}"
-                self._trace.text(number, self.tick, text, "WARN")
+                self._trace.text(number, self.tick, text, "WARN", self._train)
             if not complete:
-                self._trace.text(number, self.tick, f"cut short at tick {self.tick}", "WARN")
-        tell(
-            "run",
-            run=number,
-            ticks=self.tick,
-            frames=len(frames),
-            lost=lost,
-            dropped=dropped_now,
-            foreign=self._foreign,
-            digest=self._digest.hex(),
-            complete=complete,
+                text = f"cut short at tick {self.tick}"
+                self._trace.text(number, self.tick, text, "WARN", self._train)
+        self._ended(
+            {
+                "run": number,
+                "ticks": self.tick,
+                "frames": len(frames),
+                "lost": lost,
+                "dropped": dropped_now,
+                "foreign": self._foreign,
+                "digest": self._digest.hex(),
+                "complete": complete,
+            }
         )
         self.run = None
         self._dropped, self._foreign = dropped, 0
@@ -200,24 +265,41 @@ def lost_frames(frames: np.ndarray) -> dict[str, int]:
 
 
 def record(
-    bus: can.BusABC, recorder: Recorder, commands: queue.SimpleQueue[dict[str, Any]], stop: Stop
+    taps: list[tuple[can.BusABC, Recorder]],
+    commands: queue.SimpleQueue[dict[str, Any]],
+    stop: Stop,
 ) -> None:
-    """Record until `stop`. Raises can.CanError if the bus is gone."""
+    """Record until `stop`. Raises can.CanError if a bus is gone."""
     while not stop.requested:
-        received = recv_frames(bus, IDLE_S)
-        if received:
-            recorder.take(received, dropped_frames(bus))
+        heard = listen(taps, IDLE_S)
         while not commands.empty():
             command = commands.get()
             if command["command"] == "stop":
                 stop.requested = True
             else:
-                recorder.obey(command)
-        if received:
-            time.sleep(PAUSE_S)
+                for _bus, recorder in taps:
+                    recorder.obey(command)
+        if heard:
+            time.sleep(PAUSE_S * len(taps))
     deadline = time.monotonic() + DRAIN_S
-    while (received := recv_frames(bus, SILENCE_S)) and time.monotonic() < deadline:
-        recorder.take(received, dropped_frames(bus))
+    while listen(taps, SILENCE_S) and time.monotonic() < deadline:
+        pass
+
+
+def listen(taps: list[tuple[can.BusABC, Recorder]], timeout_s: float) -> bool:
+    """What has come on all buses; whether anything has, within `timeout_s` in all."""
+    heard = False
+    for bus, recorder in taps:
+        received = recv_frames(bus, timeout_s / len(taps))
+        if received:
+            recorder.take(received, dropped_frames(bus))
+            heard = True
+    return heard
+
+
+def frames_folder(kept: Path, train: int) -> Path:
+    """Where `--keep-frames` keeps the frames of a train: the leader's in the folder itself."""
+    return kept if train == 0 else kept / f"train_{train + 1}"
 
 
 def save_settings(path: Path, reference: Reference, **settings: Any) -> None:
@@ -250,7 +332,7 @@ def main() -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--bus", required=True)
+    parser.add_argument("--bus", required=True, action="append", help="once for each train")
     parser.add_argument("--out", type=Path, required=True, help="folder of trace.rrd")
     parser.add_argument("--trace", type=Path, metavar="FILE", help="from save_settings; else none")
     parser.add_argument("--keep-frames", type=Path, metavar="DIR", help="for frames_RUN.npy")
@@ -260,13 +342,22 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.getsignal(signal.SIGTERM))
     commands: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     follow_parent(commands.put)
+    opened = ExitStack()
     try:
         trace = None
         if arguments.trace is not None:
             trace = open_trace(arguments.out / "trace.rrd", arguments.trace)
-        recorder = Recorder(trace, arguments.keep_frames)
-        bus = open_bus(arguments.bus)
+        line = RunsOfLine(len(arguments.bus))
+        taps = []
+        for train, name in enumerate(arguments.bus):
+            kept = arguments.keep_frames
+            if kept is not None:
+                kept = frames_folder(kept, train)
+                kept.mkdir(exist_ok=True)
+            recorder = Recorder(trace, kept, train, partial(line.ended, train))
+            taps.append((opened.enter_context(open_bus(name)), recorder))
     except (OSError, ValueError) as error:  # the bus, the trace, its settings
+        opened.close()
         tell("error", message=f"recorder: {error}")
         return 1
     e2e.check(0, -1, RUN_CTRL.data_id)  # compiles, or loads what was compiled before
@@ -274,19 +365,20 @@ def main() -> int:
     tell("ready")
     status = 0
     try:
-        record(bus, recorder, commands, stop)
+        record(taps, commands, stop)
     except can.CanError as error:
-        tell("error", message=f"recorder: bus {arguments.bus} is gone: {error}")
+        tell("error", message=f"recorder: bus {', '.join(arguments.bus)} is gone: {error}")
         status = 2
     except (OSError, ValueError) as error:
         tell("error", message=f"recorder: {error}")
         status = 1
     try:
-        recorder.finish(dropped_frames(bus))
+        for bus, recorder in reversed(taps):
+            recorder.finish(dropped_frames(bus))
     except (OSError, ValueError) as error:
         tell("error", message=f"recorder: {error}")
         status = 1
-    bus.shutdown()
+    opened.close()
     return status
 
 

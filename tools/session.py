@@ -23,18 +23,19 @@ from controller import node
 from controller.calibration import Calibration
 from controller.interface import fault_names
 from controller.registry import is_file, load_law
-from plant_sim.scenario import FOLDER, Loaded, load
-from tools import hil, metrics, record, setup, sil
-from tools.frames import Digest
+from plant_sim.scenario import FOLDER, Loaded, load, members
+from tools import hil, line, record, setup, sil
+from tools.frames import LineDigest
 from tools.hil import RunError
 from tools.lyapunov import has_lyapunov, lyapunov
 from tools.observer import CONTROLLER, PATIENCE_S, PLANT, measured_truth
-from tools.recorder import save_settings
+from tools.recorder import frames_folder, save_settings
 
 SCHEMA = 1
 EXTERNAL_LAW = "external"  # of a controller that is not ours
 RUNS_MAX = 4095  # Iteration has 12 bits
 BACKLOG_RUNS = 4  # that a recording may be behind
+BUSY_S = 0.3  # how long to listen for other traffic, on all buses together
 
 
 class SessionError(ValueError):
@@ -80,6 +81,7 @@ class Session:
 
     options: Options
     loaded: Loaded
+    members: list[Loaded]  # the scenario of each train
     law: str
     runs: range
     listener: Listener
@@ -95,14 +97,17 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     were completed and the reason), KeyboardInterrupt likewise.
     """
     loaded = load(options.scenario)
-    law, calibration, runs = _controller(options, loaded)
+    trains = members(loaded)
+    if len(trains) > 1:
+        _refuse_what_is_for_one_train(options)
+    law, calibrations, runs = _controllers(options, trains)
     if runs[-1] > RUNS_MAX:
         raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
     if options.record is not None:
         record.check_target(options.record)
     prepare(options.out)
     listener.begin(loaded, law, runs)
-    session = Session(options, loaded, law, runs, listener)
+    session = Session(options, loaded, trains, law, runs, listener)
     session.summary = {
         "schema": SCHEMA,
         "scenario": loaded.name,
@@ -118,9 +123,9 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     }
     try:
         if options.mode == "hil":
-            _run_hil(session, calibration)
+            _run_hil(session, calibrations)
         else:
-            _run_in_process(session, calibration)
+            _run_in_process(session, calibrations)
     except RunError as error:
         session.summary["ended_early"] = str(error)
         raise
@@ -132,20 +137,32 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     return session.summary
 
 
-def _controller(options: Options, loaded: Loaded) -> tuple[str, Calibration | None, range]:
-    """The law, what the controller is flashed with, and the numbers of the runs."""
+def _refuse_what_is_for_one_train(options: Options) -> None:
+    """Raises SessionError for what a line of several trains has not."""
+    for what, asked in (
+        ("a memory file", options.memory),
+        ("a recording", options.record),
+        ("an external node", options.external),
+    ):
+        if asked:
+            raise SessionError(f"{what} is for one train, {options.scenario} is a line")
+
+
+def _controllers(options: Options, trains: list[Loaded]) -> tuple[str, list[Calibration], range]:
+    """The law, what the controllers are flashed with, and the numbers of the runs."""
+    loaded = trains[0]
     if options.external and options.mode != "hil":
         raise SessionError(f"an external node needs mode hil, this is {options.mode}")
     count = options.runs or loaded.scenario.runs
     if CONTROLLER in options.external:
         if options.law is not None or options.memory is not None:
             raise SessionError("law and memory of an external controller are its own")
-        return EXTERNAL_LAW, None, range(1, count + 1)
+        return EXTERNAL_LAW, [], range(1, count + 1)
     law = options.law or loaded.scenario.law
     load_law(law)
-    calibration = setup.calibration_for(loaded, law)
-    learned = -1 if options.memory is None else node.last_iteration(calibration, options.memory)
-    return law, calibration, setup.run_numbers(law, count, learned)
+    calibrations = [setup.calibration_for(train, law) for train in trains]
+    learned = -1 if options.memory is None else node.last_iteration(calibrations[0], options.memory)
+    return law, calibrations, setup.run_numbers(law, count, learned)
 
 
 def prepare(out: Path) -> None:
@@ -191,68 +208,88 @@ def _recording(session: Session) -> Iterator[None]:
 def _finish_run(
     session: Session,
     run: int,
-    frames: np.ndarray,
-    truth: np.ndarray,
+    frames: list[np.ndarray],
+    truths: list[np.ndarray],
     seconds: float,
-    faults: list[str],
+    faults: list[list[str]],
     frames_lost: int = 0,
 ) -> dict[str, Any]:
-    """The row of a run, added to the summary and shown.
+    """The row of a run, added to the summary and shown; a list has an entry for each train.
 
-    `frames_lost` are frames that were on the bus and are not in `frames`.
+    `frames_lost` are frames that were on the buses and are not in `frames`.
     """
     if session.recording is not None:
-        session.recording.add(run, frames)
-    measured = metrics.run_metrics(
-        session.loaded,
-        truth,
-        sil.commanded_force_n(frames, len(truth)),
-        setup.error_weight(session.loaded, session.law),
-    )
+        session.recording.add(run, frames[0])
+    measured = line.run_row(session.members, session.law, frames, truths)
     row = {
         "run": run,
         **measured,
-        "ticks_per_s": len(truth) / seconds,
+        "ticks_per_s": len(truths[0]) / seconds,
         "frames_lost": frames_lost,
-        "faults": faults,
+        "faults": faults[0],
     }
+    if "trains" in measured:
+        row["faults"] = [
+            f"train {train}: {name}" for train, names in enumerate(faults, 1) for name in names
+        ]
+        for of_train, names in zip(measured["trains"], faults, strict=True):
+            of_train["faults"] = names
     session.summary["runs"].append(row)
     session.listener.row(row)
     return row
 
 
-def _run_in_process(session: Session, calibration: Any) -> None:
+def _set_digest(session: Session, digest: str, of_trains: list[str]) -> None:
+    """The digest so far, and for a line that of each train."""
+    session.summary["digest"] = digest
+    if len(of_trains) > 1:
+        session.summary["digests"] = of_trains
+
+
+def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
     options, loaded = session.options, session.loaded
-    digest = Digest()
+    digest = LineDigest(len(calibrations))
+    nodes = [node.build(calibration, options.memory) for calibration in calibrations]
+    session.summary["controller"] = {
+        "state_bytes": nodes[0].state_bytes,
+        "memory_bytes": nodes[0].memory_bytes,
+    }
     with _recording(session), ExitStack() as stack:
         writer = None
         if options.trace:
             writer = _trace_writer(session)
             stack.callback(writer.close)
-        for result, controller in sil.run(
+        for results in sil.run_line(
             loaded,
-            calibration,
+            nodes,
             runs=session.runs,
             seed=options.seed,
-            memory_file=options.memory,
             progress=session.listener.progress,
         ):
-            digest.update(result.frames)
-            session.summary["digest"] = digest.hex()
-            session.summary["controller"] = {
-                "state_bytes": controller.state_bytes,
-                "memory_bytes": controller.memory_bytes,
-            }
-            row = _finish_run(
-                session, result.run, result.frames, result.truth, result.seconds, result.faults
-            )
+            frames = [result.frames for result in results]
+            truths = [result.truth for result in results]
+            faults = [result.faults for result in results]
+            digest.update(frames)
+            _set_digest(session, digest.hex(), digest.of_trains())
+            run, seconds = results[0].run, results[0].seconds
+            row = _finish_run(session, run, frames, truths, seconds, faults)
             if writer is not None:
-                writer.frames(result.run, result.frames)
-                writer.truth(result.run, result.truth)
-                if has_lyapunov(loaded, session.law):
-                    column = lyapunov(loaded, session.law, result.frames, result.truth)
-                    writer.truth(result.run, column)
-                writer.run_summary(result.run, row)
+                for train, of_train in enumerate(frames):
+                    writer.frames(run, of_train, train)
+                for table in (np.stack(truths), *_own_columns(session, frames, truths)):
+                    for train, column in enumerate(table):
+                        writer.truth(run, column, train)
+                writer.run_summary(run, row)
+
+
+def _own_columns(
+    session: Session, frames: list[np.ndarray], truths: list[np.ndarray]
+) -> Iterator[np.ndarray]:
+    """Tables [trains, ticks] of what only some laws or lines have, for the trace."""
+    if len(truths) > 1:
+        yield line.line_columns(session.members, session.law, frames, truths)
+    elif session.law != EXTERNAL_LAW and has_lyapunov(session.loaded, session.law):
+        yield lyapunov(session.loaded, session.law, frames[0], truths[0])[None]
 
 
 def _trace_settings(session: Session) -> dict[str, Any]:
@@ -266,6 +303,8 @@ def _trace_settings(session: Session) -> dict[str, Any]:
         "period_s": loaded.scenario.period_s,
         "estimates": [f"{name} [{unit}]" for name, unit, _q in estimates],
         "cars": _cars(loaded),
+        "trains": len(session.members),
+        "spacing_m": loaded.scenario.line.spacing_m if loaded.scenario.line else 0.0,
     }
 
 
@@ -294,23 +333,35 @@ def _recorder_arguments(session: Session, kept: Path) -> list[str]:
     return arguments
 
 
-def _run_hil(session: Session, calibration: Any) -> None:
+def line_buses(name: str, trains: int) -> list[str]:
+    """A bus for each train: vcan0, vcan1, …; a name without a number gets one."""
+    if trains == 1:
+        return [name]
+    stem = name.rstrip("0123456789")
+    first = int(name[len(stem) :] or 0)
+    return [f"{stem}{number}" for number in range(first, first + trains)]
+
+
+def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
     options, loaded = session.options, session.loaded
     choice = choose_bus(options.bus)
     if choice.interface == "virtual":
         raise SessionError(
             f"bus {options.bus!r} lives inside one process; HIL needs one between processes"
         )
+    buses = line_buses(choice.name, len(session.members))
     session.summary["bus"] = choice.name
-    session.listener.note(f"bus {choice.name}: {choice.reason}")
+    through = f" to {buses[-1]}" if len(buses) > 1 else ""
+    session.listener.note(f"bus {buses[0]}{through}: {choice.reason}")
     if PLANT not in options.external:  # which may well be there, and announce itself
-        _refuse_busy_bus(choice.name)
+        for bus in buses:
+            _refuse_busy_bus(bus, BUSY_S / len(buses))
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, _recording(session):
         kept = Path(scratch)
         events = hil.run(
             scenario=loaded.source,
-            calibration=calibration,
-            bus=choice.name,
+            controllers=calibrations,
+            buses=buses,
             runs=session.runs,
             seed=options.seed,
             out=options.out,
@@ -336,10 +387,10 @@ def _record_the_rest(session: Session, kept: Path) -> None:
             session.recording.add(run, np.load(kept / f"frames_{run}.npy"))
 
 
-def _refuse_busy_bus(name: str) -> None:
+def _refuse_busy_bus(name: str, listen_s: float) -> None:
     """Two sessions on one bus would answer each other."""
     with open_bus(name) as bus:
-        if recv_frames(bus, 0.3):
+        if recv_frames(bus, listen_s):
             raise SessionError(
                 f"bus {name!r} carries other traffic; choose another, e.g. --bus hub:second"
             )
@@ -352,7 +403,7 @@ def _on_event(
     leader = "observer" if PLANT in session.options.external else PLANT
     if kind == "progress":
         session.listener.progress(event["run"], event["tick"])
-    elif kind == "ready" and name == CONTROLLER:
+    elif kind == "ready" and name.startswith(CONTROLLER):
         session.summary["controller"] = {
             "state_bytes": event["state_bytes"],
             "memory_bytes": event["memory_bytes"],
@@ -377,7 +428,7 @@ def _on_run(
             f"run {run} has {led['ticks']} ticks, the recorder heard {recorder['ticks']}:"
             " it began before the recorder was ready, or frames were lost"
         )
-    session.summary["digest"] = recorder["digest"]
+    _set_digest(session, recorder["digest"], recorder["digests"])
     lost, dropped = recorder["lost"], recorder["dropped"]
     frames_lost = max(dropped, sum(lost.values()))
     if frames_lost:
@@ -390,20 +441,23 @@ def _on_run(
             f"run {run}: {recorder['foreign']} frames that are not standard data frames of 8 bytes"
             " are not in the recording"
         )
-    frames_file = kept / f"frames_{run}.npy"
-    frames = np.load(frames_file)
-    frames_file.unlink()
+    files = [
+        frames_folder(kept, train) / f"frames_{run}.npy" for train in range(len(session.members))
+    ]
+    frames = [np.load(file) for file in files]
+    for file in files:
+        file.unlink()
     tap = bench.nodes["recorder"]
     if PLANT in session.options.external:
-        truth = measured_truth(frames, led["ticks"], session.loaded.scenario.period_s)
+        period_s = session.loaded.scenario.period_s
+        truths = [measured_truth(frames[0], led["ticks"], period_s)]
     else:
-        truth = np.load(led["file"])
+        truths = list(np.load(led["file"]))
         tap.command(command="truth", run=run, file=led["file"])
-        if session.law != EXTERNAL_LAW and has_lyapunov(session.loaded, session.law):
-            lyapunov_file = kept / f"lyapunov_{run}.npy"
-            np.save(lyapunov_file, lyapunov(session.loaded, session.law, frames, truth))
-            tap.command(command="truth", run=run, file=str(lyapunov_file))
-    row = _finish_run(
-        session, run, frames, truth, led["seconds"], fault_names(led["faults"]), frames_lost
-    )
+        for number, table in enumerate(_own_columns(session, frames, truths)):
+            file = kept / f"columns_{run}_{number}.npy"
+            np.save(file, table)
+            tap.command(command="truth", run=run, file=str(file))
+    faults = [fault_names(bits) for bits in led["faults"]]
+    row = _finish_run(session, run, frames, truths, led["seconds"], faults, frames_lost)
     tap.command(command="summary", run=run, row=row)

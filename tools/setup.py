@@ -6,8 +6,11 @@ from typing import Any
 
 import msgspec
 
-from controller.calibration import Calibration, GuardSettings, MemorySettings, calibrate
+from controller.calibration import Calibration, GuardSettings, Line, MemorySettings, calibrate
+from controller.neighbours import NeighbourSettings
+from controller.node import Controller, build
 from controller.quantise import CalibrationError, Characteristic, Vehicle
+from controller.rebasing import RebasingSettings
 from controller.registry import is_file, law_label, load_law
 from plant_sim import track
 from plant_sim.scenario import Loaded, Scenario, ScenarioError
@@ -40,10 +43,33 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
             car_traction_max_n=scenario.train.traction_max_n,
             car_brake_max_n=scenario.train.brake_max_n,
             map_sections=_map_sections(scenario),
+            line=_line(loaded),
             scenario_digest=loaded.digest,
         )
     except CalibrationError as error:
         raise ScenarioError(f"{loaded.path}: {error}") from None
+
+
+def controllers_for(trains: list[Loaded], law: str) -> list[Controller]:
+    """A controller for each train, without a memory file. Raises ScenarioError as above."""
+    return [build(calibration_for(train, law)) for train in trains]
+
+
+def _line(loaded: Loaded) -> Line | None:
+    """The train's place on the line, and what it makes of its neighbours."""
+    line, control = loaded.scenario.line, loaded.scenario.control
+    if line is None:
+        return None
+    return Line(
+        start_m=loaded.start_m,
+        spacing_m=line.spacing_m,
+        ahead=loaded.train > 0,
+        behind=loaded.train + 1 < line.trains,
+        neighbours=_settings("control.neighbours", control.neighbours, NeighbourSettings),
+        rebasing=_settings("control.rebasing", control.rebasing, RebasingSettings)
+        if control.rebasing is not None
+        else None,
+    )
 
 
 def vehicle(scenario: Scenario) -> Vehicle:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from can_dbc.codec import FORCE_CMD, MESSAGE_COUNT, MESSAGES
-from can_dbc.step import int64, step
+from can_dbc.step import step
 from controller import node as controller_node
 from controller.calibration import Calibration
 from controller.interface import fault_names
@@ -58,8 +58,8 @@ def clear(mailboxes: Any) -> None:
 
 
 def build_loop(controller_tick: Any, sense: Any, actuate_and_advance: Any) -> Any:
-    """Loop over `ticks` control periods of plant and controller; returns the number of frames
-    logged."""
+    """Loop over `ticks` control periods of the plant and the controllers of all its trains; leaves
+    the number of frames logged of each train in `counts`."""
 
     @step
     def loop(
@@ -74,22 +74,32 @@ def build_loop(controller_tick: Any, sense: Any, actuate_and_advance: Any) -> An
         profile: Any,
         state: Any,
         cells: Any,
-        to_controller: Any,
+        to_controllers: Any,
         to_plant: Any,
         frames: Any,
-    ) -> Any:
-        count = int64(0)
+        counts: Any,
+    ) -> None:
+        trains = len(plant_state)
+        for train in range(trains):
+            counts[train] = 0
         for tick in range(ticks):
-            clear(to_controller)
-            sense(plant_params[0], limits, plant_state[0], chance[tick], to_controller)
-            count = log_mailboxes(to_controller, tick, frames, count)
-            clear(to_plant)
-            controller_tick(params[0], profile, state[0], cells, to_controller, to_plant, 1)
-            count = log_mailboxes(to_plant, tick, frames, count)
-            actuate_and_advance(
-                plant_params[0], track, plant_state[0], chance[tick], to_plant, truth[tick]
-            )
-        return count
+            for train in range(trains):
+                clear(to_controllers[train])
+            sense(plant_params, limits, plant_state, chance, tick, to_controllers)
+            for train in range(trains):
+                count = log_mailboxes(to_controllers[train], tick, frames[train], counts[train])
+                clear(to_plant[train])
+                controller_tick(
+                    params[train],
+                    profile,
+                    state[train],
+                    cells[train],
+                    to_controllers[train],
+                    to_plant[train],
+                    1,
+                )
+                counts[train] = log_mailboxes(to_plant[train], tick, frames[train], count)
+            actuate_and_advance(plant_params, track, plant_state, chance, tick, to_plant, truth)
 
     return loop
 
@@ -103,7 +113,8 @@ def run(
     memory_file: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[tuple[RunResult, controller_node.Controller]]:
-    """The runs numbered `runs`, one after the other; `progress(run, tick)` is called as they go."""
+    """The runs of a single train numbered `runs`, one after the other; `progress(run, tick)` is
+    called as they go."""
     node = controller_node.build(calibration, memory_file)
     yield from run_controller(loaded, node, runs=runs, seed=seed, progress=progress)
 
@@ -117,61 +128,95 @@ def run_controller(
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[tuple[RunResult, controller_node.Controller]]:
     """The same with a controller that the caller has built."""
-    here = world.build(loaded, seed)
-    here.tx, here.rx = node.rx, node.tx  # the mailboxes are the bus
-    _begin, sense, actuate_and_advance = here.steps
-    loop = build_loop(node.tick, sense, actuate_and_advance)
+    for (result,) in run_line(loaded, [node], runs=runs, seed=seed, progress=progress):
+        yield result, node
 
-    def drive(ticks: int, chance: Any, truth: Any, frames: Any) -> int:
-        return int(
-            loop(
-                ticks,
-                here.params,
-                here.limits,
-                here.track,
-                here.state,
-                chance,
-                truth,
-                node.params,
-                node.profile,
-                node.state,
-                node.cells,
-                node.rx,
-                node.tx,
-                frames,
-            )
+
+def run_line(
+    loaded: Loaded,
+    nodes: list[controller_node.Controller],
+    *,
+    runs: range,
+    seed: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[list[RunResult]]:
+    """The runs of all trains, with a controller for each in `nodes`; a result for each."""
+    here = world.build(loaded, seed)
+    params, state, cells = _put_side_by_side(nodes, here)
+    loop = build_loop(nodes[0].tick, here.sense, here.actuate_and_advance)
+    trains = len(nodes)
+    counts = np.zeros(trains, np.int64)
+
+    def drive(ticks: int, chance: Any, truth: Any, frames: Any) -> None:
+        loop(
+            ticks,
+            here.params,
+            here.limits,
+            here.track,
+            here.state,
+            chance,
+            truth,
+            params,
+            nodes[0].profile,
+            state,
+            cells,
+            here.tx,
+            here.rx,
+            frames,
+            counts,
         )
 
     # Compiles, or loads what was compiled before.
-    drive(0, *(world.rows(np.zeros(1, kind)) for kind in (plant.CHANCE, plant.TRUTH, FRAME)))
+    kinds = (plant.CHANCE, plant.TRUTH, FRAME)
+    drive(0, *(world.rows(np.zeros((trains, 0), kind)) for kind in kinds))
     for number in runs:
         if progress:
             progress(number, 0)
-        _announce(here, node, plant.ARMED, number)
+        _announce(here, nodes, plant.ARMED, number)
         here.begin(here.params, here.state)
-        chance = world.rows(world.chance(loaded, seed, number))
-        ticks = len(chance)
-        truth = np.zeros(ticks, plant.TRUTH)
+        chance = world.chances(here, number)
+        ticks = chance.shape[1]
+        truth = np.zeros((trains, ticks), plant.TRUTH)
         # As many rows as there could be; the system gives memory to those that are written.
-        frames = np.empty(ticks * MESSAGE_COUNT, FRAME)
+        frames = np.empty((trains, ticks * MESSAGE_COUNT), FRAME)
         started = time.perf_counter()
-        count = drive(ticks, chance, world.rows(truth), world.rows(frames))
+        drive(ticks, chance, world.rows(truth), world.rows(frames))
         seconds = time.perf_counter() - started
-        faults = fault_names(int(node.state[0]["core"]["faults"]))
-        _announce(here, node, plant.ENDED, number)
+        faults = [fault_names(int(node.state[0]["core"]["faults"])) for node in nodes]
+        _announce(here, nodes, plant.ENDED, number)
         if progress:
             progress(number, ticks)
-        yield RunResult(number, frames[:count], truth, faults, seconds), node
+        yield [
+            RunResult(number, frames[train][: counts[train]], truth[train], faults[train], seconds)
+            for train in range(trains)
+        ]
+
+
+def _put_side_by_side(
+    nodes: list[controller_node.Controller], here: world.World
+) -> tuple[Any, Any, Any]:
+    """Params, state and memories of all controllers as arrays; the controllers keep views of their
+    rows, and of the plant's mailboxes, which are the buses."""
+    params = world.rows(np.zeros(len(nodes), nodes[0].params.dtype))
+    state = world.rows(np.zeros(len(nodes), nodes[0].state.dtype))
+    cells = np.stack([node.cells for node in nodes])
+    for train, node in enumerate(nodes):
+        params[train], state[train] = node.params[0], node.state[0]
+        node.params, node.state = params[train : train + 1], state[train : train + 1]
+        node.cells = cells[train]
+        node.rx, node.tx = here.tx[train], here.rx[train]
+    return params, state, cells
 
 
 def _announce(
-    here: world.World, node: controller_node.Controller, run_state: int, run: int
+    here: world.World, nodes: list[controller_node.Controller], run_state: int, run: int
 ) -> None:
-    """RUN_CTRL outside a run, and the controller's answer."""
-    clear(node.rx)
-    clear(node.tx)
-    plant.announce(here.state[0]["node"], run_state, run, node.rx)
-    controller_node.cycle(node, 0)
+    """RUN_CTRL outside a run, and the controllers' answers."""
+    for train, node in enumerate(nodes):
+        clear(node.rx)
+        clear(node.tx)
+        plant.announce(here.state[train]["node"], run_state, run, node.rx)
+        controller_node.cycle(node, 0)
 
 
 def commanded_force_n(frames: np.ndarray, ticks: int) -> np.ndarray:

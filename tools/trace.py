@@ -11,6 +11,8 @@ beside it in a branch of its own:
     /runs/KEY               the summary of each run, on timeline `run`
     /events                 texts
 
+Of a line of several trains, each run_NN has an entity train_NN for each of them.
+
 Timelines: `tick` (control period inside the run), `time` (simulated time inside the run), `run`.
 Runs share the first two, so that a view that takes a plot of several runs overlays them.
 """
@@ -18,6 +20,7 @@ Runs share the first two, so that a view that takes a plot of several runs overl
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -25,6 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from can_dbc.codec import (
+    ATO_RADIO,
     ATO_STATUS,
     ATO_TRACKING,
     ATP_LIMIT,
@@ -146,6 +150,8 @@ PLOTS = (
             Line(NEIGHBOUR_BEHIND_MOTION, "OffsetSpeed", "behind, re-based", PINK),
         ),
     ),
+    Plot("rebased_position", "m", (Line(ATO_RADIO, "Offset", "own timetable", BLUE),)),
+    Plot("rebased_speed", "m/s", (Line(ATO_RADIO, "OffsetSpeed", "own timetable", BLUE),)),
 )
 
 CAR_FORCES = (CAR_FORCE_1, CAR_FORCE_2, CAR_FORCE_3, CAR_FORCE_4)  # two cars each
@@ -175,6 +181,9 @@ LANES = (
     Lane("behind_valid", NEIGHBOUR_BEHIND_POSITION, "Valid"),
     Lane("behind_emergency_brake", NEIGHBOUR_BEHIND_POSITION, "EmergencyBrake"),
     Lane("behind_rebased", NEIGHBOUR_BEHIND_POSITION, "Rebased"),
+    Lane("rebased", ATO_RADIO, "Rebased"),
+    Lane("emergency_brake_to_rear", ATO_RADIO, "EmergencyBrakeToRear"),
+    Lane("emergency_brake_to_front", ATO_RADIO, "EmergencyBrakeToFront"),
 )
 OVERVIEW_LANES = ("mode", "supervision", "guard", "faults", "sensor")
 
@@ -250,6 +259,8 @@ class TraceWriter:
         first_run: int = 1,
         last_run: int = 10,
         names: Sequence[str] = (),
+        trains: int = 1,
+        spacing_m: float = 0.0,
     ) -> None:
         """Create the file and log the reference.
 
@@ -261,6 +272,8 @@ class TraceWriter:
         :param first_run: number of the first run that is expected, for the colours of the runs.
         :param last_run: number of the last one; more may come.
         :param names: of the runs, from `first_run` on, where they are not runs of one law.
+        :param trains: of the line; each method takes what concerns one of them, 0 leads.
+        :param spacing_m: from the reference of a train to that of the next one.
         :raises TraceError: the file cannot be written, or `cars` is out of range.
         """
         import rerun as rr  # costs a second and 100 MB: only who writes a trace pays for it
@@ -272,15 +285,17 @@ class TraceWriter:
         self._period_ns = round(period_s * 1e9)
         self._first_run, self._last_run = first_run, last_run
         self._names = tuple(names)
+        self._trains, self._spacing_m = trains, spacing_m
         self._reference = reference
         self._cars = cars
         self._estimates = tuple(estimates)
         self._plots = (*PLOTS, _car_force_plot(cars)) if cars else PLOTS
         self._state_names = {lane.name: _state_names(lane) for lane in LANES}
         self._run: int | None = None
-        self._states: dict[str, int] = {}  # last value of each lane in this run
+        self._states: dict[str, int] = {}  # last value of each lane, by its entity
         self._styled: set[str] = set()  # entities whose static style is logged
         self._summary: list[dict[str, Any]] = []
+        self._train_rows: defaultdict[int, list[dict[str, Any]]] = defaultdict(list)
 
         # Equal for equal arguments, but for no two files: a viewer merges recordings of one name.
         identity = (str(path.resolve()), title, period_s, cars, estimates, first_run, last_run)
@@ -301,55 +316,68 @@ class TraceWriter:
             index = self._index(np.arange(len(values)))
             self._log_scalars(f"reference/{field}", index, values, ["reference"], [ORANGE])
 
-    def frames(self, run: int, frames: np.ndarray) -> None:
-        """Log FRAME rows of whole ticks; the batches of a run follow one another.
+    def frames(self, run: int, frames: np.ndarray, train: int = 0) -> None:
+        """Log FRAME rows of whole ticks; the batches of a train's run follow one another.
 
         Batches of 100 ticks and more are cheap: a batch costs some milliseconds by itself.
         """
         found = {message.name: columns(frames, message) for message in MESSAGES}
-        if run != self._run:
+        if self._run is None or run > self._run:
             self._run = run
-            self._states.clear()
-            neighbours = len(found[NEIGHBOUR_AHEAD_POSITION.name][0]) > 0
-            layout = _blueprint(self._run_name(run), self._cars > 0, self._estimates, neighbours)
-            self._stream.send_blueprint(layout)
+            self._stream.send_blueprint(
+                _blueprint(
+                    self._run_name(run),
+                    self._place(run, train=0),
+                    self._cars > 0,
+                    self._estimates,
+                    self._trains,
+                )
+            )
         for plot in self._plots:
             ticks, values = _table(plot, found)
             names = [line.label for line in plot.lines]
             colours = [line.colour for line in plot.lines]
             widths = [line.width for line in plot.lines]
-            entity = self._entity(f"bus/{plot.name}", run)
+            entity = self._entity(f"bus/{plot.name}", run, train)
             self._log_scalars(entity, self._index(ticks, run), values, names, colours, widths)
         for number, name in enumerate(self._estimates):
             ticks, value = estimate(frames, number)
-            entity = self._entity(f"bus/estimate_{number}", run)
+            entity = self._entity(f"bus/estimate_{number}", run, train)
             index = self._index(ticks, run)
-            self._log_scalars(entity, index, value[:, None], [name], [self._colour(run)])
+            colour = self._colour(run, train)
+            self._log_scalars(entity, index, value[:, None], [name], [colour])
         for lane in LANES:
-            self._log_lane(run, lane, *found[lane.message.name])
-        self._log_frames(run, frames)
+            self._log_lane(run, train, lane, *found[lane.message.name])
+        self._log_frames(run, train, frames)
 
-    def truth(self, run: int, table: np.ndarray) -> None:
+    def truth(self, run: int, table: np.ndarray, train: int = 0) -> None:
         """Log the true state of the plant: a structured array of float64 fields, a row a tick.
 
-        The names of the fields end in their units. The errors of `position_m` and `speed_m_s`
-        against the reference are logged beside them.
+        The names of the fields end in their units; a field of NaN alone is none of this train's.
+        The errors of `position_m` and `speed_m_s` against the reference are logged beside them.
         """
         index = self._index(np.arange(len(table)), run)
+        colour = self._colour(run, train)
+        label = self._run_name(run) if self._trains == 1 else f"train_{train + 1}"
+        label = label.replace("_", " ")
+        single = self._trains == 1
         for field in table.dtype.names or ():
-            entity = self._entity(f"truth/{field}", run)
-            self._log_scalars(entity, index, table[field][:, None], ["true"], [GREEN])
+            if np.isnan(table[field]).all():
+                continue
+            entity = self._entity(f"truth/{field}", run, train)
+            style = (["true"], [GREEN]) if single else ([label], [colour])
+            self._log_scalars(entity, index, table[field][:, None], *style)
         for error, field in ERRORS.items():
             if field not in (table.dtype.names or ()):
                 continue  # a column of its own, such as the Lyapunov function
             reference = getattr(self._reference, field)
+            if field == "position_m":
+                reference = reference - train * self._spacing_m
             count = min(len(table), len(reference))
             values = (table[field][:count] - reference[:count])[:, None]
-            entity = self._entity(f"truth/{error}", run)
+            entity = self._entity(f"truth/{error}", run, train)
             index = self._index(np.arange(count), run)
-            self._log_scalars(
-                entity, index, values, [self._run_name(run).replace("_", " ")], [self._colour(run)]
-            )
+            self._log_scalars(entity, index, values, [label], [colour])
 
     def run_summary(self, run: int, row: dict[str, Any]) -> None:
         """Log a run's row of summary.json: its numbers on timeline `run`, bars, and a table."""
@@ -369,13 +397,20 @@ class TraceWriter:
                     color=BLUE,
                 )
                 self._stream.log(f"runs/bars/{key}", bars, static=True, strict=True)
-        document = rr.TextDocument(_markdown(self._summary), media_type="text/markdown")
+        text = _markdown(self._summary)
+        for each in row.get("trains", []):
+            self._train_rows[run].append(
+                {key: value for key, value in each.items() if isinstance(value, int | float)}
+            )
+        for number, rows in self._train_rows.items():
+            text += f"\n\nTrains of run {number}\n\n" + _markdown(rows)
+        document = rr.TextDocument(text, media_type="text/markdown")
         self._stream.log("runs/table", document, static=True, strict=True)
 
-    def text(self, run: int, tick: int, message: str, level: str = "INFO") -> None:
+    def text(self, run: int, tick: int, message: str, level: str = "INFO", train: int = 0) -> None:
         """Log an event; `level` is one of Rerun's: INFO, WARN, ERROR, CRITICAL."""
         content = self._rr.TextLog.columns(text=[message], level=[level])
-        self._send("events", self._index(np.array([tick]), run), content)
+        self._send("events" + self._branch(train), self._index(np.array([tick]), run), content)
 
     def close(self) -> None:
         """Write everything out, with the footer that makes the file complete.
@@ -389,15 +424,23 @@ class TraceWriter:
         finally:
             self._stream.disconnect()
 
-    def _entity(self, name: str, run: int) -> str:
-        return f"{name}/{self._run_name(run)}"
+    def _entity(self, name: str, run: int, train: int) -> str:
+        return f"{name}/{self._place(run, train)}"
+
+    def _place(self, run: int, train: int) -> str:
+        return self._run_name(run) + self._branch(train)
+
+    def _branch(self, train: int) -> str:
+        return f"/train_{train + 1:02d}" if self._trains > 1 else ""
 
     def _run_name(self, run: int) -> str:
         if self._names:
             return self._names[run - self._first_run]
         return f"run_{run:0{max(2, len(str(self._last_run)))}}"
 
-    def _colour(self, run: int) -> Colour:
+    def _colour(self, run: int, train: int) -> Colour:
+        if self._trains > 1:
+            return _ramp(train / (self._trains - 1))
         return _ramp((run - self._first_run) / max(self._last_run - self._first_run, 1))
 
     def _index(self, ticks: np.ndarray, run: int | None = None) -> list[rr.TimeColumn]:
@@ -429,17 +472,19 @@ class TraceWriter:
             self._stream.log(entity, style, static=True, strict=True)
         self._send(entity, index, self._rr.Scalars.columns(scalars=values))
 
-    def _log_lane(self, run: int, lane: Lane, ticks: np.ndarray, words: np.ndarray) -> None:
+    def _log_lane(
+        self, run: int, train: int, lane: Lane, ticks: np.ndarray, words: np.ndarray
+    ) -> None:
         """Log where a state changes."""
         if len(ticks) == 0:
             return
+        entity = self._entity("bus/state", run, train) + f"/{lane.name}"
         values = decode_column(words, getattr(lane.message, lane.signal))
         # No state is negative: the first one of a run is a change.
-        changes = np.flatnonzero(np.diff(values, prepend=self._states.get(lane.name, -1)))
-        self._states[lane.name] = int(values[-1])
+        changes = np.flatnonzero(np.diff(values, prepend=self._states.get(entity, -1)))
+        self._states[entity] = int(values[-1])
         if len(changes) == 0:
             return
-        entity = self._entity("bus/state", run) + f"/{lane.name}"
         names = self._state_names[lane.name]
         if entity not in self._styled:
             self._styled.add(entity)
@@ -452,14 +497,14 @@ class TraceWriter:
         index = self._index(ticks[changes], run)
         self._send(entity, index, self._rr.StateChange.columns(state=states))
 
-    def _log_frames(self, run: int, frames: np.ndarray) -> None:
+    def _log_frames(self, run: int, train: int, frames: np.ndarray) -> None:
         """Log the frames as they were, a row a tick."""
         import pyarrow as pa
 
         ticks, counts = np.unique(frames["tick"], return_counts=True)
         components = {name: pa.array(frames[name]) for name in ("frame_id", "payload")}
         content = self._rr.DynamicArchetype.columns("ato_hil.Frames", components=components)
-        entity = self._entity("bus/frames", run)
+        entity = self._entity("bus/frames", run, train)
         self._send(entity, self._index(ticks, run), content.partition(counts))
 
     def _send(self, entity: str, index: list[rr.TimeColumn], content: Any) -> None:
@@ -540,9 +585,10 @@ def _markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def _blueprint(
-    current: str, car_forces: bool, estimates: Sequence[str], neighbours: bool
+    run: str, current: str, car_forces: bool, estimates: Sequence[str], trains: int
 ) -> rrb.Blueprint:
-    """The views; `current` is the run in those that show one run."""
+    """The views; `run` is the run in those that show one, `current` the train of it in those that
+    show one train."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -610,6 +656,8 @@ def _blueprint(
         plot("Position of the neighbours [m]", f"bus/neighbour_position/{current}"),
         plot("Speed of the neighbours [m/s]", f"bus/neighbour_speed/{current}"),
         plot("Age of the radio data [s]", f"bus/neighbour_age/{current}"),
+        plot("Timetable against the common one [m]", f"bus/rebased_position/{current}"),
+        plot("Speed of the timetable [m/s]", f"bus/rebased_speed/{current}"),
     )
     signals = rrb.Grid(
         plot("Position [m]", f"bus/position/{current}", "reference/position_m"),
@@ -627,7 +675,7 @@ def _blueprint(
         ),
         plot("Speed error [m/s]", f"bus/speed_error/{current}", f"truth/speed_error_m_s/{current}"),
         plot("Distance to the ATP target [m]", f"bus/target_distance/{current}"),
-        *(radio if neighbours else ()),
+        *(radio if trains > 1 else ()),
         grid_columns=3,
         name="Signals",
     )
@@ -642,8 +690,20 @@ def _blueprint(
         rrb.TextLogView(name="Events", origin="/events"),
         name="Events",
     )
+    line = rrb.Horizontal(
+        by_run(
+            "Space-time diagram, leader violet, last train yellow [m]", f"truth/position_m/{run}"
+        ),
+        rrb.Vertical(
+            by_run("Separation from the train ahead [m]", f"truth/separation_m/{run}"),
+            by_run("Distance to the barrier [m]", f"truth/barrier_distance_m/{run}"),
+            by_run("Position error [m]", f"truth/position_error_m/{run}"),
+            by_run("Speed error [m/s]", f"truth/speed_error_m_s/{run}"),
+        ),
+        name="Line",
+    )
     return rrb.Blueprint(
-        rrb.Tabs(overview, signals, runs, log),
+        rrb.Tabs(*((line,) if trains > 1 else ()), overview, signals, runs, log),
         rrb.TimePanel(state="collapsed", timeline="time", play_state="paused"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),

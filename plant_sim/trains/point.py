@@ -61,6 +61,8 @@ class Train(
     resistance: Resistance
     characteristic: Characteristic | None = None  # none: the plant gives what it is asked for
     start_m: float = 0.0  # where it stands when a run begins
+    # Whether the actuators then hold it against its resistance; else they give no force.
+    held_at_start: bool = False
     substeps: int = 5
 
     # What a train of several cars has: this one has no cars, its sensors are in one place.

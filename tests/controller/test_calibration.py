@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from controller import calibration, distribution
-from controller.calibration import GuardSettings, MemorySettings
+from controller.calibration import GuardSettings, Line, MemorySettings
 from controller.memory import initial_memory
+from controller.neighbours import NeighbourSettings
 from controller.quantise import CalibrationError, Vehicle, fixed
+from controller.rebasing import RebasingSettings
 from controller.reference import SEGMENT
 from controller.registry import LawError, law_names, law_number, load_law
 
@@ -117,6 +119,59 @@ def test_cars_get_their_distribution():
 
 
 # What is refused.
+
+
+def line(**changes):
+    rebasing = {"error_max_m": 0.15, "l1_m": 400.0, "l2_m": 600.0, "speed_max_m_s": 24.0}
+    settings = {
+        "start_m": -1000.0,
+        "spacing_m": 500.0,
+        "ahead": True,
+        "behind": False,
+        "neighbours": NeighbourSettings(),
+        "rebasing": RebasingSettings(**rebasing | changes.pop("rebasing", {})),
+    }
+    return Line(**settings | changes)
+
+
+def test_a_train_of_a_line_knows_its_place():
+    params = calibrate(line=line()).params[0]
+    assert params["neighbours"]["exists"].tolist() == [1, 0]
+    assert params["neighbours"]["start"] == -1000 * 2**15
+    assert params["neighbours"]["age_max"] == 150
+    assert params["rebasing"]["enabled"] == 1
+    assert params["rebasing"]["spacing"] == 500 * 2**15
+
+
+def test_a_train_that_may_not_re_base_and_one_alone():
+    params = calibrate(line=Line(0.0, 500.0, False, True, NeighbourSettings())).params[0]
+    assert params["rebasing"]["enabled"] == 0
+    assert params["neighbours"]["exists"].tolist() == [0, 1]
+    alone = calibrate().params
+    assert not np.any(alone["neighbours"].view(np.uint8))
+    assert not np.any(alone["rebasing"].view(np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"neighbours": NeighbourSettings(age_max_s=9.0)},
+            "control.neighbours.age_max_s is 9, expected 0.01 to 2.55",
+        ),
+        ({"start_m": -1e5}, "line.start_m: -100000 is outside what the firmware holds, +-65536"),
+        (
+            {"rebasing": {"error_max_m": 1e5}},
+            "control.rebasing: error_max: 100000 is outside what the firmware holds, +-65536",
+        ),
+        (
+            {"rebasing": {"l2_m": 300.0}},
+            "control.rebasing: l1_m, l2_m are 400, 300, expected 0 < l1_m < l2_m",
+        ),
+    ],
+)
+def test_wrong_numbers_of_a_line_are_refused_with_their_key(changes, message):
+    assert refusal(line=line(**changes)) == message
 
 
 def test_an_unknown_law_is_named_with_those_there_are():

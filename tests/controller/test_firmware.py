@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from can_dbc import e2e
 from can_dbc.codec import (
     ATO_ESTIMATE,
+    ATO_RADIO,
     ATO_STATUS,
     ATO_TRACKING,
     ATP_LIMIT,
@@ -16,6 +17,10 @@ from can_dbc.codec import (
     FORCE_CMD,
     MESSAGE_COUNT,
     MESSAGES,
+    NEIGHBOUR_AHEAD_MOTION,
+    NEIGHBOUR_AHEAD_POSITION,
+    NEIGHBOUR_BEHIND_MOTION,
+    NEIGHBOUR_BEHIND_POSITION,
     RUN_CTRL,
     TRAIN_POSITION,
     TRAIN_SPEED,
@@ -24,7 +29,7 @@ from can_dbc.codec import (
     put,
 )
 from controller import calibration, node, store
-from controller.calibration import GuardSettings, MemorySettings
+from controller.calibration import GuardSettings, Line, MemorySettings
 from controller.interface import (
     ARMED,
     BRAKE,
@@ -33,8 +38,11 @@ from controller.interface import (
     FAULT_ATP,
     FAULT_CONTROL_LOST,
     FAULT_LIMIT_LOST,
+    FAULT_LINE_EMERGENCY,
+    FAULT_NEIGHBOUR_LOST,
     FAULT_OVERSPEED,
     FAULT_POSITION_LOST,
+    FAULT_REBASED,
     FAULT_SENSOR,
     FAULT_SPEED_LOST,
     FAULT_TICK,
@@ -45,7 +53,9 @@ from controller.interface import (
     RUNNING,
     TRACTION,
 )
+from controller.neighbours import NeighbourSettings
 from controller.quantise import Vehicle
+from controller.rebasing import RebasingSettings
 from controller.reference import SEGMENT
 
 MASS_KG = 200_000.0
@@ -58,7 +68,7 @@ PROFILE = np.array([(1, 0), (100, JERK), (200, -JERK), (100, JERK)], SEGMENT)
 GAINS = {"kp": 1e5, "kD": 0.0, "gp": 3e5, "gI": 0.0, "gD": 0.0}
 
 
-def calibrated():
+def calibrated(line=None):
     """A law that learns, two cars, previewed reference."""
     return calibration.calibrate(
         law="pdilc",
@@ -74,6 +84,7 @@ def calibrated():
         motor_cars=[1, 3],
         car_traction_max_n=[],
         car_brake_max_n=[],
+        line=line,
         scenario_digest="d" * 32,
     )
 
@@ -82,6 +93,23 @@ def calibrated():
 def built():
     """Compiled once; every test starts it anew."""
     return node.build(calibrated())
+
+
+SPACING_M = 500.0
+SECOND_OF_THREE = Line(
+    start_m=-SPACING_M,
+    spacing_m=SPACING_M,
+    ahead=True,
+    behind=True,
+    neighbours=NeighbourSettings(age_max_s=0.2),
+    rebasing=RebasingSettings(error_max_m=0.15, l1_m=400.0, l2_m=600.0, speed_max_m_s=20.0),
+)
+
+
+@pytest.fixture(scope="module")
+def built_on_a_line(built):
+    """The same between two trains."""
+    return node.build(calibrated(SECOND_OF_THREE))
 
 
 class Bench:
@@ -548,6 +576,154 @@ def test_the_file_is_there_before_the_end_is_answered(bench, tmp_path):
     assert stored.cells.ravel().tolist() == learned(bench)
 
 
+# Neighbours.
+
+AHEAD_FRAMES = NEIGHBOUR_AHEAD_POSITION, NEIGHBOUR_AHEAD_MOTION
+BEHIND_FRAMES = NEIGHBOUR_BEHIND_POSITION, NEIGHBOUR_BEHIND_MOTION
+
+
+@pytest.fixture
+def on_a_line(built_on_a_line):
+    """A train between two others, armed."""
+    bench = Bench(built_on_a_line)
+    bench.start()
+    return bench
+
+
+def hear(bench, frames, position_m, speed_m_s=0.0, age=0, offset_speed_m_s=0.0, **bits):
+    """The two frames of a neighbour."""
+    position, motion = frames
+    raw = round(position_m / position.Position.scale)
+    bench.put(position, **({"Valid": 1, "Position": raw, "Age": age} | bits))
+    bench.put(
+        motion,
+        Speed=round(speed_m_s / motion.Speed.scale),
+        OffsetSpeed=round(offset_speed_m_s / motion.OffsetSpeed.scale),
+    )
+
+
+def stand(bench, **changes):
+    """A tick in which all stand in their places."""
+    return bench.run_tick(**{"position": -SPACING_M} | changes)
+
+
+def radio(sent):
+    word = sent[ATO_RADIO.name]
+    return {
+        name: int(get(word, getattr(ATO_RADIO, name))) * getattr(ATO_RADIO, name).scale
+        for name in ("OffsetSpeed", "Rebased", "EmergencyBrakeToRear", "EmergencyBrakeToFront")
+    } | {"Offset": int(get(word, ATO_RADIO.Offset)) * ATO_RADIO.Offset.scale}
+
+
+def test_the_timetable_starts_at_the_trains_place(on_a_line):
+    word = stand(on_a_line)[ATO_TRACKING.name]
+    assert get(word, ATO_TRACKING.PositionError) == 0
+    assert on_a_line.inputs["ahead_position"] == -SPACING_M * 2**15
+
+
+def test_neighbours_are_seen_from_the_tick_of_their_frames(on_a_line):
+    hear(on_a_line, AHEAD_FRAMES, 1.0, 0.5)
+    hear(on_a_line, BEHIND_FRAMES, -999.0, -0.25)
+    stand(on_a_line)
+    assert on_a_line.inputs["neighbour"].tolist() == [1, 1]
+    assert (on_a_line.inputs["distance"] / 2**15).tolist() == [-501.0, 499.0]
+    assert (on_a_line.inputs["closing"] / 2**24).tolist() == [0.5, -0.25]
+    stand(on_a_line)
+    assert on_a_line.inputs["neighbour"].tolist() == [1, 1]
+
+
+def test_half_a_neighbour_is_none(on_a_line):
+    """Position and speed of different ticks do not belong together."""
+    hear(on_a_line, AHEAD_FRAMES, 0.0)
+    on_a_line.controller.rx[NEIGHBOUR_AHEAD_MOTION.index]["fresh"] = 0
+    hear(on_a_line, BEHIND_FRAMES, -1000.0)
+    on_a_line.controller.rx[NEIGHBOUR_BEHIND_POSITION.index]["payload"] ^= 1 << 20
+    stand(on_a_line)
+    assert on_a_line.inputs["neighbour"].tolist() == [0, 0]
+    assert on_a_line.link(NEIGHBOUR_BEHIND_POSITION)["lost"] == 1
+
+
+def test_a_lost_neighbour_is_a_fault_that_does_not_brake(on_a_line):
+    hear(on_a_line, AHEAD_FRAMES, 0.0)
+    for _ in range(21):
+        hear(on_a_line, BEHIND_FRAMES, -1000.0)
+        stand(on_a_line)
+    assert on_a_line.core["faults"] == 0
+    hear(on_a_line, BEHIND_FRAMES, -1000.0)
+    stand(on_a_line)
+    assert on_a_line.core["faults"] == FAULT_NEIGHBOUR_LOST
+    assert on_a_line.core["guard"] == GUARD_NORMAL
+    assert on_a_line.inputs["neighbour"].tolist() == [0, 1]
+
+
+def test_a_train_alone_hears_nobody_and_tells_nobody(bench):
+    bench.start()
+    for _ in range(30):
+        hear(bench, AHEAD_FRAMES, 100.0, EmergencyBrake=1)
+        sent = bench.run_tick()
+        assert ATO_RADIO.name not in sent
+    assert bench.inputs["neighbour"].tolist() == [0, 0]
+    assert bench.core["faults"] == 0
+
+
+def test_the_radio_frame_comes_every_tenth_tick(on_a_line):
+    for tick in range(25):
+        sent = stand(on_a_line)
+        assert (ATO_RADIO.name in sent) == (tick % 10 == 0)
+    assert list(sent)[-1] == FORCE_CMD.name
+
+
+def test_on_its_timetable_a_train_tells_zeros(on_a_line):
+    hear(on_a_line, AHEAD_FRAMES, 0.0)
+    assert set(radio(stand(on_a_line)).values()) == {0}
+
+
+def test_a_train_that_cannot_follow_says_so(on_a_line):
+    stand(on_a_line)
+    for _ in range(10):
+        sent = stand(on_a_line, position=-SPACING_M - 3.0, speed=-0.5)
+    assert on_a_line.core["faults"] & FAULT_REBASED
+    told = radio(sent)
+    assert told["Rebased"] == 1
+    assert told["Offset"] == pytest.approx(-2.85, abs=0.01)
+    assert told["OffsetSpeed"] == pytest.approx(0, abs=0.02)  # a reference does not run backwards
+    assert told["EmergencyBrakeToRear"] == told["EmergencyBrakeToFront"] == 0
+    word = status(sent)["Faults"] if ATO_STATUS.name in sent else 0
+    assert word & FAULT_REBASED
+
+
+def test_the_own_brake_is_told_both_ways(on_a_line):
+    stand(on_a_line)
+    for _ in range(10):
+        sent = stand(on_a_line, supervision=3)
+    told = radio(sent)
+    assert (told["EmergencyBrakeToRear"], told["EmergencyBrakeToFront"]) == (1, 1)
+    assert on_a_line.core["faults"] & FAULT_LINE_EMERGENCY
+
+
+@pytest.mark.parametrize(("frames", "rear", "front"), [(AHEAD_FRAMES, 1, 0), (BEHIND_FRAMES, 0, 1)])
+def test_anothers_brake_is_told_onwards_and_the_train_brakes(on_a_line, frames, rear, front):
+    place = 0.0 if frames is AHEAD_FRAMES else -2 * SPACING_M
+    for tick in range(21):
+        hear(on_a_line, frames, place, EmergencyBrake=int(tick > 0))
+        sent = stand(on_a_line)
+    told = radio(sent)
+    assert (told["EmergencyBrakeToRear"], told["EmergencyBrakeToFront"]) == (rear, front)
+    assert told["Rebased"] == 1
+    assert on_a_line.core["faults"] == FAULT_REBASED | FAULT_LINE_EMERGENCY
+    assert on_a_line.inputs["reference_speed"] == 0  # while the timetable has started
+    assert on_a_line.core["guard"] == GUARD_NORMAL
+
+
+def test_a_new_run_forgets_the_line(on_a_line):
+    hear(on_a_line, AHEAD_FRAMES, 0.0, EmergencyBrake=1)
+    stand(on_a_line)
+    on_a_line.start(iteration=2)
+    told = radio(stand(on_a_line))
+    assert set(told.values()) == {0}
+    assert on_a_line.inputs["neighbour"].tolist() == [0, 0]
+
+
 # Garbage.
 
 
@@ -567,10 +743,20 @@ def garbage(draw):
 @settings(max_examples=60)
 @given(boxes=st.lists(garbage(), min_size=1, max_size=5), period=st.integers(0, 1))
 def test_whatever_is_in_the_mailboxes_nothing_overflows(built, interpreted, boxes, period):
-    bench = Bench(built)
+    nothing_overflows(built, interpreted, boxes, period)
+
+
+@settings(max_examples=60)
+@given(boxes=st.lists(garbage(), min_size=1, max_size=5), period=st.integers(0, 1))
+def test_nor_on_a_line(built_on_a_line, interpreted, boxes, period):
+    nothing_overflows(built_on_a_line, interpreted, boxes, period)
+
+
+def nothing_overflows(controller, interpreted, boxes, period):
+    """Ticks with these mailboxes, compiled and on checked integers."""
+    bench = Bench(controller)
     bench.start()
     bench.run_tick(speed=1.0, position=3.0)
-    controller = bench.controller
     state, cells = controller.state.copy(), controller.cells.copy()
     for content in boxes:
         rx, tx = mailboxes(), mailboxes()

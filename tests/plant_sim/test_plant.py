@@ -43,8 +43,8 @@ class Rig:
         self.here = built(name)
         self.node = self.here.state["node"][0]
         self.train = self.here.state["train"][0]
-        self.chance = np.zeros(1, plant.CHANCE)
-        self.truth = np.zeros(1, plant.TRUTH)
+        self.chance = np.zeros((1, 1), plant.CHANCE)
+        self.truth = np.zeros((1, 1), plant.TRUTH)
         self.counters = dict.fromkeys((message.name for message in MESSAGES), 0)
         self.here.rx["fresh"][:] = 0
         self.here.begin(self.here.params, self.here.state)
@@ -56,7 +56,7 @@ class Rig:
 
     def sent(self, message, signal):
         """Physical value of a signal that was sent, None if the message was not."""
-        box = self.here.tx[message.index]
+        box = self.here.tx[0][message.index]
         layout = getattr(message, signal)
         return get(int(box["payload"]), layout) * layout.scale if box["fresh"] else None
 
@@ -68,7 +68,7 @@ class Rig:
         )
         counter = self.counters[message.name] if counter is None else counter
         self.counters[message.name] = e2e.next_counter(counter)
-        box = self.here.rx[message.index]
+        box = self.here.rx[0][message.index]
         box["payload"] = e2e.protect(word, counter, message.data_id) ^ flip
         box["fresh"] = 1
 
@@ -79,7 +79,7 @@ class Rig:
             here.params, here.track, here.state, self.chance, 0, here.rx, self.truth
         )
         here.rx["fresh"][:] = 0
-        return self.truth[0].copy()
+        return self.truth[0, 0].copy()
 
     def force(self):
         """The command that is obeyed, N."""
@@ -96,7 +96,7 @@ def test_every_frame_passes_the_end_to_end_check():
         rig.sense()
         rig.advance()
         for message in (RUN_CTRL, ATP_LIMIT, TRAIN_SPEED, TRAIN_POSITION):
-            box = rig.here.tx[message.index]
+            box = rig.here.tx[0][message.index]
             if box["fresh"]:
                 word = int(box["payload"])
                 assert e2e.check(word, last.get(message.name, -1), message.data_id) == e2e.OK
@@ -276,17 +276,17 @@ def test_truth_shows_the_couplers():
 @pytest.mark.parametrize("run_state", [plant.ARMED, plant.ENDED])
 def test_an_announcement_is_confirmed_only_by_its_own_state_and_run(run_state):
     rig = Rig()
-    plant.announce(rig.node, run_state, 12, rig.here.tx)
+    plant.announce(rig.node, run_state, 12, rig.here.tx[0])
     assert rig.sent(RUN_CTRL, "RunState") == run_state
     assert rig.sent(RUN_CTRL, "Iteration") == 12
     answers = [(run_state, 11), (plant.RUNNING, 12), (run_state, 12)]
     confirmed = []
     for state, iteration in answers:
         rig.receive(ATO_STATUS, RunState=state, Iteration=iteration)
-        confirmed.append(plant.confirmed(rig.node, rig.here.rx))
+        confirmed.append(plant.confirmed(rig.node, rig.here.rx[0]))
     assert confirmed == [0, 0, 1]
     rig.here.rx["fresh"][:] = 0
-    assert plant.confirmed(rig.node, rig.here.rx) == 0
+    assert plant.confirmed(rig.node, rig.here.rx[0]) == 0
 
 
 # The same bits everywhere.
@@ -299,8 +299,8 @@ from plant_sim.scenario import load
 for name in ("subway-paper", "subway"):
     loaded = load(name)
     here = world.build(loaded, 3)
-    chance = world.rows(world.chance(loaded, 3, 1))
-    truth = world.rows(np.zeros(40, plant.TRUTH))
+    chance = world.chances(here, 1)
+    truth = world.rows(np.zeros((1, 40), plant.TRUTH))
     here.begin(here.params, here.state)
     for tick in range(40):
         here.state["node"]["command_n"][0, :6] = (2e4 if tick < 25 else -6e4) + 100.0 * tick
@@ -308,7 +308,7 @@ for name in ("subway-paper", "subway"):
         here.actuate_and_advance(
             here.params, here.track, here.state, chance, tick, here.rx, truth
         )
-        print(here.tx["payload"].tolist(), np.asarray(truth)[tick].tobytes().hex())
+        print(here.tx["payload"].tolist(), np.asarray(truth)[0, tick].tobytes().hex())
 """
 
 

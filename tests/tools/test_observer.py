@@ -101,7 +101,7 @@ def test_the_runs_of_a_foreign_plant_are_told(told) -> None:
         for tick in range(ticks):
             observer.take([*nodes.question(tick, run), nodes.answer(tick)], 1000.0 * run + 1.0)
         observer.take(nodes.end(run, faults), 1000.0 * run + 5.0)
-        found = {"run": run, "ticks": ticks, "seconds": 5.0, "faults": faults}
+        found = {"run": run, "ticks": ticks, "seconds": 5.0, "faults": [faults]}
         assert told[run - 1] == {"event": "run", **found}
     assert told[2:] == [{"event": "done"}]
     assert observer.runs_left == 0

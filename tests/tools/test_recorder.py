@@ -34,7 +34,7 @@ from can_dbc.codec import (
 from can_dbc.hub_server import ERROR
 from tools import recorder as recorder_module
 from tools.frames import FRAME, Digest
-from tools.recorder import FIRST_ROWS, Recorder, lost_frames, save_settings
+from tools.recorder import FIRST_ROWS, Recorder, RunsOfLine, lost_frames, save_settings
 
 STATES = choices("RUN_CTRL", "RunState")
 ARMED, RUNNING, ENDED = STATES["armed"], STATES["running"], STATES["ended"]
@@ -99,13 +99,13 @@ class Log:
         self.batches: list[tuple[int, np.ndarray]] = []
         self.calls: list[tuple[Any, ...]] = []
 
-    def frames(self, run: int, frames: np.ndarray) -> None:
+    def frames(self, run: int, frames: np.ndarray, train: int = 0) -> None:
         self.batches.append((run, frames.copy()))
 
-    def text(self, run: int, tick: int, message: str, level: str = "INFO") -> None:
+    def text(self, run: int, tick: int, message: str, level: str = "INFO", train: int = 0) -> None:
         self.calls.append(("text", run, tick, message, level))
 
-    def truth(self, run: int, table: np.ndarray) -> None:
+    def truth(self, run: int, table: np.ndarray, train: int = 0) -> None:
         self.calls.append(("truth", run, table))
 
     def run_summary(self, run: int, row: dict[str, Any]) -> None:
@@ -556,3 +556,21 @@ def test_a_command_that_fails_ends_the_recorder_with_its_trace(
     assert "missing.npy" in event["message"]
     assert process.wait(30) == 1
     RrdReader(str(tmp_path / "trace.rrd")).store()
+
+
+def test_a_run_of_a_line_has_ended_when_it_has_on_every_bus(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    line = RunsOfLine(2)
+    event = {"ticks": 10, "frames": 40, "lost": {}, "complete": True}
+    line.ended(1, {"run": 1, "digest": "b1", **event})
+    line.ended(1, {"run": 2, "digest": "b2", **event, "lost": {"TRAIN_SPEED": 3}})
+    assert capsys.readouterr().out == ""
+    line.ended(0, {"run": 1, "digest": "a1", **event})
+    line.ended(0, {"run": 2, "digest": "a2", **event, "ticks": 9, "complete": False})
+    first, second = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (first["run"], first["digests"], first["complete"]) == (1, ["a1", "b1"], True)
+    assert first["frames"] == 80
+    assert (second["run"], second["digests"], second["complete"]) == (2, ["a2", "b2"], False)
+    assert second["ticks"] == 9
+    assert second["lost"] == {"TRAIN_SPEED of train 2": 3}

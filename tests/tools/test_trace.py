@@ -417,3 +417,31 @@ def test_positions_beyond_the_first_sixteen_bits_of_ticks_keep_their_tick(tmp_pa
     writer.frames(1, frames)
     writer.close()
     assert Trace(tmp_path / "trace.rrd").ticks("/bus/position/run_01") == [70_000]
+
+
+def test_the_trains_of_a_line_have_entities_and_references_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "trace.rrd"
+    writer = open_writer(path, trains=2, spacing_m=500.0, cars=0, estimates=[])
+    frames = [random_frames(), random_frames()]
+    for train in (0, 1):
+        writer.frames(1, frames[train], train)
+        truth = np.zeros(TICKS, TRUTH)
+        truth["position_m"] = REFERENCE.position_m - 500.0 * train + 0.25 * (train + 1)
+        writer.truth(1, truth, train)
+    columns = np.full((2, TICKS), np.nan, np.dtype([("separation_m", np.float64)]))
+    columns["separation_m"][1] = 499.75
+    for train in (0, 1):
+        writer.truth(1, columns[train], train)
+    writer.text(1, 3, "lost frames", "WARN", 1)
+    row = {"run": 1, "max_position_error_m": 0.5, "trains": [{"train": 1}, {"train": 2}]}
+    writer.run_summary(1, row)
+    writer.close()
+    found = Trace(path)
+    for train in (0, 1):
+        place = f"run_01/train_0{train + 1}"
+        np.testing.assert_array_equal(found.frames(f"/bus/frames/{place}"), frames[train])
+        error = found.values(f"/truth/position_error_m/{place}")
+        np.testing.assert_allclose(error, 0.25 * (train + 1), atol=1e-12)
+    assert set(found.values("/truth/separation_m/run_01/train_02").ravel()) == {499.75}
+    assert "/truth/separation_m/run_01/train_01" not in found.chunks
+    assert found.ticks("/events/train_02") == [3]

@@ -10,8 +10,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from plant_sim.scenario import Loaded, load
-from tools import metrics, setup, sil
+from plant_sim.scenario import Loaded, load, members
+from tools import line, setup, sil
 
 
 @dataclass(frozen=True)
@@ -70,23 +70,21 @@ def threshold_text(claim: Claim) -> str:
 
 @cache
 def runs(
-    base: str, text: str = "", law: str | None = None, count: int = 10
+    base: str, text: str = "", law: str | None = None, count: int = 10, seed: int = 1
 ) -> list[dict[str, Any]]:
     """Metrics of `count` SIL runs of a scenario, or of one that stands on it with `text`
     replaced."""
     loaded = variant(base, text) if text else load(base)
     law = law or loaded.scenario.law
-    calibration = setup.calibration_for(loaded, law)
-    alpha = setup.error_weight(loaded, law)
-    return [
-        metrics.run_metrics(
-            loaded, result.truth, sil.commanded_force_n(result.frames, len(result.truth)), alpha
-        )
-        | {"run": result.run, "faults": result.faults}
-        for result, _node in sil.run(
-            loaded, calibration, runs=setup.run_numbers(law, count), seed=1
-        )
-    ]
+    trains = members(loaded)
+    nodes = setup.controllers_for(trains, law)
+    rows = []
+    for results in sil.run_line(loaded, nodes, runs=setup.run_numbers(law, count), seed=seed):
+        frames, truths = [r.frames for r in results], [r.truth for r in results]
+        row = line.run_row(trains, law, frames, truths)
+        faults = [name for result in results for name in result.faults]
+        rows.append({**row, "run": results[0].run, "faults": faults})
+    return rows
 
 
 def variant(base: str, text: str) -> Loaded:

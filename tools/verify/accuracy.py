@@ -19,10 +19,9 @@ import numpy as np
 from can_dbc.codec import mailboxes
 from can_dbc.step import step
 from controller import firmware, memory, node
-from controller.calibration import Calibration
 from controller.interface import FAULTS_THAT_BLOCK_LEARNING
 from controller.registry import is_file, law_step, load_law
-from plant_sim.scenario import Loaded, load
+from plant_sim.scenario import Loaded, load, members
 from tools import setup, sil
 from tools.verify import ABSENT, FAILED, Row, identity, row
 from tools.verify.reference import Reference
@@ -100,11 +99,10 @@ def differences(law: str, reference: Reference, loaded: Loaded) -> tuple[float, 
     with sensors that only the DBC quantises: a coarser grid would blow a last bit up to a step."""
     module = load_law(law)
     loaded = ideal_sensors(loaded)
-    calibration = setup.calibration_for(loaded, law)
     numbers = setup.run_numbers(law, RUNS)
-    shadow, truths = _runs(module, reference, loaded, calibration, numbers, drive=0)
-    _follows, reals = _runs(module, reference, loaded, calibration, numbers, drive=1)
-    truth, real = np.concatenate(truths), np.concatenate(reals)
+    shadow, truths = _runs(module, reference, loaded, law, numbers, drive=0)
+    _follows, reals = _runs(module, reference, loaded, law, numbers, drive=1)
+    truth, real = np.concatenate(truths, axis=1), np.concatenate(reals, axis=1)
     mass = loaded.scenario.train.mass_kg
     return (
         shadow * mass,
@@ -124,23 +122,42 @@ def ideal_sensors(loaded: Loaded) -> Loaded:
 
 
 def reference_runs(law: str, reference: Reference, loaded: Loaded, runs: int) -> list[np.ndarray]:
-    """The plant's truth of each run with the float64 law in the loop."""
-    calibration = setup.calibration_for(loaded, law)
+    """The truth of the first train in each run with the float64 law in the loop."""
     numbers = setup.run_numbers(law, runs)
-    return _runs(load_law(law), reference, loaded, calibration, numbers, drive=1)[1]
+    truths = _runs(load_law(law), reference, loaded, law, numbers, drive=1)[1]
+    return [truth[0] for truth in truths]
 
 
 def _runs(
     module: ModuleType,
     reference: Reference,
     loaded: Loaded,
-    calibration: Calibration,
+    law: str,
     numbers: range,
     drive: int,
 ) -> tuple[float, list[np.ndarray]]:
-    """Largest difference of the force (m/s^2), and the plant's truth of each run."""
+    """Largest difference of the force (m/s^2), and the truth of each run, [trains, ticks]."""
+    pairs = [_pair(module, reference, train, law, drive) for train in members(loaded)]
+    truth = []
+    kept = [pair.state["law"]["real"]["memory"].copy() for pair in pairs]
+    for results in sil.run_line(loaded, pairs, runs=numbers, seed=identity.SEED):
+        truth.append(np.stack([result.truth for result in results]))
+        for train, pair in enumerate(pairs):
+            # As the firmware does: a run with a fault leaves no trace in what is learned.
+            if int(pair.state["core"]["faults"][0]) & FAULTS_THAT_BLOCK_LEARNING:
+                pair.state["law"]["real"]["memory"] = kept[train]
+            else:
+                kept[train] = pair.state["law"]["real"]["memory"].copy()
+    return max(float(pair.state["law"]["difference"][0]) for pair in pairs), truth
+
+
+def _pair(
+    module: ModuleType, reference: Reference, loaded: Loaded, law: str, drive: int
+) -> node.Controller:
+    """A controller with both forms of the law."""
+    calibration = setup.calibration_for(loaded, law)
     scenario = loaded.scenario
-    gains = msgspec.convert(scenario.laws[calibration.law], module.Gains, strict=False)
+    gains = msgspec.convert(scenario.laws[law], module.Gains, strict=False)
     vehicle = setup.vehicle(scenario)
     real = reference.params(gains, vehicle)
     params = np.zeros(1, firmware.params_dtype(params_dtype(module, real)))
@@ -156,7 +173,7 @@ def _runs(
     if reference.words:
         state["law"]["real"]["memory"] = reference.initial(gains, vehicle) or 0.0
     tick = firmware.build_tick(build_pair(law_step(module), reference.force))
-    controller = node.Controller(
+    return node.Controller(
         calibration=calibration,
         tick=tick,
         call=node.callable_tick(tick),
@@ -168,13 +185,3 @@ def _runs(
         tx=mailboxes(),
         memory_file=None,
     )
-    truth = []
-    kept = state["law"]["real"]["memory"].copy()
-    for result, _node in sil.run_controller(loaded, controller, runs=numbers, seed=identity.SEED):
-        truth.append(result.truth)
-        # As the firmware does: a run with a fault leaves no trace in what is learned.
-        if int(state["core"]["faults"][0]) & FAULTS_THAT_BLOCK_LEARNING:
-            state["law"]["real"]["memory"] = kept
-        else:
-            kept = state["law"]["real"]["memory"].copy()
-    return float(state["law"]["difference"][0]), truth

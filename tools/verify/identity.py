@@ -19,9 +19,9 @@ import numpy as np
 from can_dbc.bus import socketcan_reason
 from can_dbc.hub import DEFAULT_CHANNEL
 from controller.registry import is_file, load_law
-from plant_sim.scenario import Loaded, case_names, load, scenario_names
-from tools import metrics, setup, sil
-from tools.frames import Digest
+from plant_sim.scenario import Loaded, case_names, load, members, scenario_names
+from tools import line, setup, sil
+from tools.frames import LineDigest
 from tools.verify import ABSENT, FAILED, Row, VerifyError, row
 
 GOLDEN = Path(__file__).with_name("golden.json")
@@ -98,17 +98,14 @@ def pairs(laws: list[str]) -> list[tuple[str, str]]:
 def measured(scenario: str, law: str, runs: int, ticks: int = 0) -> Golden:
     """Digest and metrics of runs compiled in this process."""
     loaded = shortened(load(scenario), ticks)
-    digest = Digest()
+    trains = members(loaded)
+    digest = LineDigest(len(trains))
     row: dict[str, Any] = {}
-    calibration = setup.calibration_for(loaded, law)
-    for result, _node in sil.run(loaded, calibration, runs=setup.run_numbers(law, runs), seed=SEED):
-        digest.update(result.frames)
-        row = metrics.run_metrics(
-            loaded,
-            result.truth,
-            sil.commanded_force_n(result.frames, len(result.truth)),
-            setup.error_weight(loaded, law),
-        )
+    nodes = setup.controllers_for(trains, law)
+    for results in sil.run_line(loaded, nodes, runs=setup.run_numbers(law, runs), seed=SEED):
+        frames = [result.frames for result in results]
+        digest.update(frames)
+        row = line.run_row(trains, law, frames, [result.truth for result in results])
     return Golden(digest.hex(), runs, {name: row.get(name) for name in GOLDEN_METRICS})
 
 

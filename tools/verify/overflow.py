@@ -212,25 +212,25 @@ def _show(records: list[np.ndarray]) -> str:
 def scenario_run(scenario: str, law: str, runs: int, ticks: int) -> Report:
     """Runs of a scenario on checked integers, plant and controller and every frame; `ticks` 0:
     whole runs."""
-    from plant_sim.scenario import load
+    from plant_sim.scenario import load, members
     from tools import setup, sil
-    from tools.frames import Digest
+    from tools.frames import LineDigest
     from tools.verify.identity import shortened
 
     loaded = shortened(load(scenario), ticks)
     peaks = _Peaks()
     peaks.install()
-    digest = Digest()
+    nodes = setup.controllers_for(members(loaded), law)
+    digest = LineDigest(len(nodes))
     numbers = setup.run_numbers(law, runs)
     try:
-        for result, _node in sil.run(
-            loaded, setup.calibration_for(loaded, law), runs=numbers, seed=1
-        ):
-            digest.update(result.frames)
+        for results in sil.run_line(loaded, nodes, runs=numbers, seed=1):
+            digest.update([result.frames for result in results])
     except OverflowError as error:
         return Report(error=where(error))
     bits, at = peaks.largest(load_law(law))
-    return Report(bits=bits, at=at, cases=runs * loaded.ticks, digest=digest.hex())
+    cases = runs * loaded.ticks * len(nodes)
+    return Report(bits=bits, at=at, cases=cases, digest=digest.hex())
 
 
 def calibrated(law: str) -> list[np.ndarray]:

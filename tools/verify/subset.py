@@ -31,6 +31,9 @@ SHARED_MODULES = (
     "controller.guard",
     "controller.gradient_map",
     "controller.characteristic",
+    "controller.separation",
+    "controller.neighbours",
+    "controller.rebasing",
     "controller.distribution",
     "controller.firmware",
 )

@@ -2,11 +2,12 @@
 measured against. One file a paper."""
 
 from tools.verify.reference import Reference
-from tools.verify.references import afilc, cailc, drac, iplc
+from tools.verify.references import afilc, cailc, drac, iplc, mtcc
 
 REFERENCES: dict[str, Reference] = {
     **cailc.REFERENCES,
     **drac.REFERENCES,
+    **mtcc.REFERENCES,
     **afilc.REFERENCES,
     **iplc.REFERENCES,
 }

@@ -1,0 +1,350 @@
+"""MTCC: adaptive cooperative control of several trains with position barriers (paper 3, eqs.
+(5)-(9), (26)-(28)).
+
+    e = x - x_d,   ev = v - v_d                                    tracking errors
+    u = fh + a1h v + a2h v^2 + a_d - beta ev - B(e) + u2 + u3                           (5), (6)
+    B(e) = alpha e / (k^2 - e^2)                                   barrier at |e| = k
+    u2   = -d sum dU/dx_i over the neighbours, controller/separation.py     (7), (8)
+    u3   = h sum (v_j - v_i)                                       consensus                 (9)
+    fh'  = -lambda_1 s - sigma_1 fh                                                     (26)
+    a1h' = -lambda_2 s v - sigma_2 a1h                                                  (27)
+    a2h' = -lambda_3 s v^2 - sigma_3 a2h,   s = ev + c e                                (28)
+
+u is the specific force. Order in a tick: errors, u with the old estimates, limits, estimates
+(Euler). a_d is previewed by the actuator's lag (firmware).
+
+Paper's errors: the print loses the minus signs of the adaptive laws, and (26)-(28) have the sigma
+terms with a plus, which grows instead of leaking. fh' = -lambda ev integrates to -lambda e: it
+adds stiffness, no integral action; c e, not in the paper, makes it act on a lasting error. Theorem
+1 gives ev -> 0, not e -> 0. The paper's gains are a spring of 25 1/s^2 with damping 0.05 1/s, less
+than the half period of hold takes away at 10 ms.
+
+Not in the paper:
+  eta                 B is a straight line of the same slope beyond |e| = eta k; (6) changes its
+                      sign outside |e| = k, and drives a train there away
+  barrier_max_m_s2    B is limited
+  cooperation_max_m_s2, and l1, l2 kept away from: see separation.py
+  slope_max_m_s3      the command's slope, as the actuators have it
+  freeze_above_m_s2   no adaptation in a tick whose command is cut by force_max, by the guard, or by
+                      more than this by slope_max_m_s3
+
+| symbol      | unit   | format             | symbol           | unit    | format            |
+| e, ev, s    | m, m/s | Q24                | alpha / k        | m/s^2   | Q24               |
+| B, u        | m/s^2  | Q27                | 1 / k            | 1/m     | Q16               |
+| v           | m/s    | Q22, +-32          | beta, h, c       | 1/s     | Q24               |
+| fh          | m/s^2  | Q56, int64, +-4    | Ts lambda_1      | 1/s     | Q36               |
+| a1h         | 1/s    | Q62, int64, +-1/8  | Ts lambda_2      | 1/m     | Q42               |
+| a2h         | 1/m    | Q62, int64, +-1/512 | Ts lambda_3     | s/m^2   | Q44               |
+| s v, s v^2  |        | Q24, Q18           | Ts sigma         | -       | Q32               |
+
+The estimates are 28, 28 and 22 bits finer than what the force needs: with the paper's lambda = 1e-7
+one tick changes fh by 1e-12.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from can_dbc.step import int64, step
+from controller import separation
+from controller.interface import FAULT_BARRIER, SIDES
+from controller.q import INT32_MAX, clamp, round_shift, sat32
+from controller.quantise import CalibrationError, Vehicle, fixed
+
+E_MAX = 1 << 30  # m, Q24: 64
+S_E_MAX = 1 << 25  # m, Q24: 2, in the adaptation
+S_EV_MAX = 1 << 25  # m/s, Q24: 2
+S_MAX = 1 << 26  # m/s, Q24: 4
+V_MAX = 1 << 27  # m/s, Q22: 32
+F_MAX = 1 << 58  # Q56
+A1_MAX = 1 << 59  # Q62
+A2_MAX = 1 << 53  # Q62
+
+BARRIER_PARAMS = np.dtype(
+    [
+        ("k", np.int32),  # m, Q24
+        ("inverse_k", np.int32),  # 1/m, Q16
+        ("scale", np.int32),  # alpha / k, m/s^2, Q24
+        ("edge", np.int32),  # eta k, m, Q24
+        ("slope", np.int32),  # of B at the edge, 1/s^2, Q12
+        ("most", np.int32),  # m/s^2, Q27
+    ],
+    align=True,
+)
+
+# What the two laws have in common.
+COMMON_PARAMS = np.dtype(
+    [
+        ("barrier", BARRIER_PARAMS),
+        ("separation", separation.PARAMS),
+        ("beta", np.int32),  # 1/s, Q24
+        ("h", np.int32),  # 1/s, Q24
+        ("force_max", np.int32),  # m/s^2, Q27
+        ("slope_max", np.int32),  # of the command in a tick, m/s^2, Q27
+        ("freeze_above", np.int32),  # m/s^2, Q27
+        ("padding", np.int32),
+    ],
+    align=True,
+)
+
+COMMON_STATE = np.dtype(
+    [
+        ("command", np.int32),  # of the last tick, m/s^2, Q27
+        ("frozen", np.int32),  # ticks of this run without adaptation
+    ],
+    align=True,
+)
+
+PARAMS = np.dtype(
+    [
+        ("common", COMMON_PARAMS),
+        ("c", np.int32),  # 1/s, Q24
+        ("f_initial", np.int32),  # m/s^2, Q28
+        ("rate", np.int32, (3,)),  # Ts lambda: Q36, Q42, Q44
+        ("leak", np.int32, (3,)),  # Ts sigma, Q32
+    ],
+    align=True,
+)
+
+STATE = np.dtype(
+    [
+        ("f", np.int64),  # m/s^2, Q56
+        ("a1", np.int64),  # 1/s, Q62
+        ("a2", np.int64),  # 1/m, Q62
+        ("common", COMMON_STATE),
+    ],
+    align=True,
+)
+STATE_BOUNDS = {"f": (-F_MAX, F_MAX), "a1": (-A1_MAX, A1_MAX), "a2": (-A2_MAX, A2_MAX)}
+
+WORDS = ()
+# Estimates in the traces: name, unit, Q.
+COMMON_ESTIMATES = (
+    ("B", "m/s^2", 27),
+    ("u2", "m/s^2", 27),
+    ("u3", "m/s^2", 27),
+    ("frozen", "ticks", 0),
+)
+ESTIMATES = (*COMMON_ESTIMATES, ("f", "m/s^2", 28), ("a1", "1/s", 34), ("a2", "1/m", 40))
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+
+
+class CommonGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Gains of both laws, SI, forces for each kilogram."""
+
+    alpha: NotNegative  # m^2/s^2
+    k: Positive  # m
+    beta: NotNegative  # 1/s
+    h: NotNegative  # 1/s
+    d: NotNegative  # m^4/s^2
+    l1_m: Positive
+    l2_m: Positive
+    eta: Annotated[float, msgspec.Meta(gt=0, le=0.99)] = 0.99
+    barrier_max_m_s2: Positive | None = None  # none: as far as the format goes, 16 m/s^2
+    cooperation_max_m_s2: Positive = 1.0
+    slope_max_m_s3: Positive | None = None  # none: not limited
+    freeze_above_m_s2: NotNegative = 0.05
+
+
+class Gains(CommonGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Gains of the law; lambda, sigma and the initial estimate of (26) to (28)."""
+
+    lam: tuple[NotNegative, NotNegative, NotNegative]  # 1/s, 1/m, s/m^2
+    sigma: tuple[NotNegative, NotNegative, NotNegative]  # 1/s
+    f_initial: float  # m/s^2
+    c: NotNegative = 0.0  # 1/s
+
+
+def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
+    """PARAMS, shape (1,). Raises CalibrationError where a gain does not fit its format."""
+    params = np.zeros(1, PARAMS)
+    params["common"] = calibrate_common(gains, vehicle)
+    params["c"] = fixed("c", gains.c, 24)
+    params["f_initial"] = fixed("f_initial", gains.f_initial, 28, 31)
+    for i, q in enumerate((36, 42, 44)):
+        rate = vehicle.period_s * gains.lam[i]
+        params["rate"][0, i] = fixed(f"Ts lam[{i}]", rate, q)
+        params["leak"][0, i] = fixed(f"Ts sigma[{i}]", vehicle.period_s * gains.sigma[i], 32)
+    return params
+
+
+def calibrate_common(gains: CommonGains, vehicle: Vehicle) -> np.ndarray:
+    """COMMON_PARAMS, shape (1,)."""
+    params = np.zeros(1, COMMON_PARAMS)
+    params["barrier"] = calibrate_barrier(gains)
+    params["separation"] = separation.calibrate(
+        l1_m=gains.l1_m, l2_m=gains.l2_m, d=gains.d, most_m_s2=gains.cooperation_max_m_s2
+    )
+    params["beta"] = fixed("beta", gains.beta, 24)
+    params["h"] = fixed("h", gains.h, 24)
+    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, 27)
+    params["slope_max"] = INT32_MAX
+    if gains.slope_max_m_s3 is not None:
+        slope = gains.slope_max_m_s3 * vehicle.period_s
+        params["slope_max"] = fixed("Ts slope_max_m_s3", slope, 27)
+    params["freeze_above"] = fixed("freeze_above_m_s2", gains.freeze_above_m_s2, 27)
+    return params
+
+
+def calibrate_barrier(gains: CommonGains) -> np.ndarray:
+    """BARRIER_PARAMS, shape (1,)."""
+    params = np.zeros(1, BARRIER_PARAMS)
+    k, edge = gains.k, gains.eta * gains.k
+    slope = gains.alpha * (k * k + edge * edge) / (k * k - edge * edge) ** 2
+    most = gains.barrier_max_m_s2
+    if edge >= 64:
+        raise CalibrationError(f"k: {k:g} is outside what the firmware holds, 64")
+    params["k"] = fixed("k", k, 24)
+    params["inverse_k"] = fixed("1 / k", 1 / k, 16)
+    params["scale"] = fixed("alpha / k", gains.alpha / k, 24)
+    params["edge"] = fixed("eta k", edge, 24)
+    params["slope"] = fixed("slope of the barrier at eta k", slope, 12)
+    params["most"] = INT32_MAX if most is None else fixed("barrier_max_m_s2", most, 27)
+    return params
+
+
+@step
+def position_error(inputs: Any) -> Any:
+    """e, m, Q24, limited to +-64."""
+    away = int64(inputs.position) - int64(inputs.reference_position)
+    return clamp(away << 9, -int64(E_MAX), int64(E_MAX))
+
+
+@step
+def speed_error(inputs: Any) -> Any:
+    """ev, m/s, Q24."""
+    return sat32(int64(inputs.speed) - int64(inputs.reference_speed))
+
+
+@step
+def barrier(params: Any, e: Any) -> Any:
+    """B(e), m/s^2, Q27; one division."""
+    inside = clamp(e, -int64(params.edge), int64(params.edge))
+    z = (inside * int64(params.inverse_k)) >> 10  # e / k, Q30
+    rest = (int64(1) << 30) - ((z * z) >> 30)
+    ratio = sat32((z << 24) // max(rest, int64(1)))  # z / (1 - z^2), Q24
+    beyond = round_shift((e - inside) * int64(params.slope), 9)
+    wanted = round_shift(ratio * int64(params.scale), 21) + beyond
+    return clamp(wanted, -int64(params.most), int64(params.most))
+
+
+@step
+def consensus(params: Any, inputs: Any) -> Any:
+    """u3 over the neighbours whose data count, m/s^2, Q27."""
+    total = int64(0)
+    for side in range(SIDES):
+        if int64(inputs.neighbour[side]) != 0:
+            total += int64(inputs.closing[side])
+    return sat32(round_shift(sat32(total) * int64(params.h), 21))
+
+
+@step
+def bounds(params: Any, inputs: Any, e: Any, outputs: Any) -> Any:
+    """What barrier and neighbours ask for: u2 + u3 - B, m/s^2, Q27; reports it."""
+    held = barrier(params.barrier, e)
+    u2 = separation.push_of_neighbours(params.separation, inputs)
+    u3 = consensus(params, inputs)
+    outputs.status = FAULT_BARRIER if abs(e) >= int64(params.barrier.k) else 0
+    outputs.estimate[0] = held
+    outputs.estimate[1] = u2
+    outputs.estimate[2] = u3
+    return u2 + u3 - held
+
+
+@step
+def begin_common(state: Any) -> None:
+    """A run starts."""
+    state.frozen = 0
+
+
+@step
+def limited(params: Any, state: Any, inputs: Any, wanted: Any) -> Any:
+    """1 if the command that `wanted` (m/s^2, Q27) becomes must not teach; writes state.command."""
+    most = int64(params.force_max)
+    within = clamp(wanted, -most, most)
+    # The train is held at the start with what its law asks for first.
+    last = within if int64(inputs.tick) == 0 else int64(state.command)
+    slope = int64(params.slope_max)
+    command = clamp(within, last - slope, last + slope)
+    state.command = command
+    cut = wanted != within or abs(within - command) > int64(params.freeze_above)
+    if cut or int64(inputs.limited) != 0:
+        state.frozen = sat32(int64(state.frozen) + 1)
+        return int64(1)
+    return int64(0)
+
+
+@step
+def speed_of(inputs: Any) -> Any:
+    """v, m/s, Q22, limited to +-32."""
+    return clamp(int64(inputs.speed) >> 2, -int64(V_MAX), int64(V_MAX))
+
+
+@step
+def resistance(state: Any, v: Any) -> Any:
+    """fh + a1h v + a2h v^2, m/s^2, Q27."""
+    v2 = (v * v) >> 28  # Q16, at most 2^26
+    return (
+        round_shift(int64(state.f), 29)
+        + round_shift((int64(state.a1) >> 28) * v, 29)
+        + round_shift((int64(state.a2) >> 22) * v2, 29)
+    )
+
+
+@step
+def adapt(params: Any, state: Any, s: Any, v: Any) -> None:
+    """The estimates a tick on; s Q24 in +-4, v Q22 in +-32."""
+    s_v = round_shift(s * v, 22)  # Q24, at most 2^31
+    s_v2 = round_shift(s_v * v, 28)  # Q18, at most 2^30
+    f = int64(state.f)
+    a1 = int64(state.a1)
+    a2 = int64(state.a2)
+    # The leak works on the estimate's upper 32 bits: Q28, Q34, Q40, times Q32.
+    f -= round_shift(s * int64(params.rate[0]), 4)
+    f -= round_shift((int64(state.f) >> 28) * int64(params.leak[0]), 4)
+    a1 -= round_shift(s_v * int64(params.rate[1]), 4)
+    a1 -= round_shift((int64(state.a1) >> 28) * int64(params.leak[1]), 4)
+    a2 -= s_v2 * int64(params.rate[2])
+    a2 -= round_shift((int64(state.a2) >> 22) * int64(params.leak[2]), 10)
+    state.f = clamp(f, -int64(F_MAX), int64(F_MAX))
+    state.a1 = clamp(a1, -int64(A1_MAX), int64(A1_MAX))
+    state.a2 = clamp(a2, -int64(A2_MAX), int64(A2_MAX))
+
+
+@step
+def adapting_error(params: Any, e: Any, ev: Any) -> Any:
+    """s, m/s, Q24, of errors limited to 2 m and 2 m/s."""
+    near = clamp(e, -int64(S_E_MAX), int64(S_E_MAX))
+    slow = clamp(ev, -int64(S_EV_MAX), int64(S_EV_MAX))
+    return clamp(slow + round_shift(near * int64(params.c), 24), -int64(S_MAX), int64(S_MAX))
+
+
+@step
+def mtcc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+    """One tick of the adaptive cooperative law."""
+    common = params.common
+    if int64(inputs.tick) == 0:
+        begin_common(state.common)
+        state.f = int64(params.f_initial) << 28
+        state.a1 = 0
+        state.a2 = 0
+    e = position_error(inputs)
+    ev = speed_error(inputs)
+    v = speed_of(inputs)
+    wanted = resistance(state, v) + int64(inputs.ahead_acceleration)
+    wanted -= round_shift(int64(common.beta) * ev, 21)
+    wanted += bounds(common, inputs, e, outputs)
+    outputs.estimate[4] = sat32(round_shift(int64(state.f), 28))
+    outputs.estimate[5] = sat32(round_shift(int64(state.a1), 28))
+    outputs.estimate[6] = sat32(round_shift(int64(state.a2), 22))
+    if limited(common, state.common, inputs, wanted) == 0:
+        adapt(params, state, adapting_error(params, e, ev), v)
+    outputs.force = clamp(
+        int64(state.common.command), -int64(common.force_max), int64(common.force_max)
+    )
+    outputs.estimate[3] = state.common.frozen

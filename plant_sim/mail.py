@@ -1,0 +1,31 @@
+"""Protected frames in and out of the mailboxes of a plant node."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from can_dbc import e2e
+from can_dbc.step import int64, step
+
+
+@step
+def send(node: Any, tx: Any, message: Any, word: Any) -> None:
+    """Protects `word` and puts it into the message's mailbox."""
+    counter = int64(node.sent[message.index])
+    node.sent[message.index] = e2e.next_counter(counter)
+    tx[message.index].payload = e2e.protect(word, counter, message.data_id)
+    tx[message.index].fresh = 1
+
+
+@step
+def received(node: Any, rx: Any, message: Any) -> Any:
+    """1 if the mailbox holds a new frame that passes the end-to-end check."""
+    if int64(rx[message.index].fresh) == 0:
+        return int64(0)
+    word = int64(rx[message.index].payload)
+    found = e2e.check(word, int64(node.received[message.index]), message.data_id)
+    if found == e2e.CORRUPT or found == e2e.REPEATED:
+        node.refused += 1
+        return int64(0)
+    node.received[message.index] = (word >> 8) & 15
+    return int64(1)
