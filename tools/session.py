@@ -140,12 +140,12 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
 def _refuse_what_is_for_one_train(options: Options) -> None:
     """Raises SessionError for what a line of several trains has not."""
     for what, asked in (
-        ("a memory file", options.memory),
-        ("a recording", options.record),
-        ("an external node", options.external),
+        ("memory file", options.memory),
+        ("recording", options.record),
+        ("external node", options.external),
     ):
         if asked:
-            raise SessionError(f"{what} is for one train, {options.scenario} is a line")
+            raise SessionError(f"{options.scenario}: a line of several trains takes no {what}")
 
 
 def _controllers(options: Options, trains: list[Loaded]) -> tuple[str, list[Calibration], range]:

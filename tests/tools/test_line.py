@@ -83,7 +83,7 @@ def channel(tmp_path: Path) -> str:
 
 
 def test_hil_with_a_bus_for_each_train_gives_the_bits_of_sil(tmp_path: Path) -> None:
-    name = short(tmp_path, more="runs = 2")
+    name = short(tmp_path, duration_s=8.0, more="runs = 2")
     sil = ato_hil("run", name, "--mode", "sil", "--out", "sil", cwd=tmp_path)
     assert sil.returncode == 0, sil.stderr
     hil = ato_hil("run", name, "--bus", channel(tmp_path), "--out", "hil", cwd=tmp_path)
@@ -238,10 +238,20 @@ def test_each_train_has_a_bus(name: str, trains: int, buses: list[str]) -> None:
 # What goes wrong.
 
 
-def test_a_memory_file_is_for_one_train(tmp_path: Path) -> None:
-    done = ato_hil("run", "line", "--memory", "m.bin", "--out", "o", cwd=tmp_path)
+@pytest.mark.parametrize(
+    ("option", "value", "what"),
+    [
+        ("--memory", "m.bin", "memory file"),
+        ("--record", "r.log", "recording"),
+        ("--external", "controller", "external node"),
+    ],
+)
+def test_what_is_for_one_train_is_refused(
+    tmp_path: Path, option: str, value: str, what: str
+) -> None:
+    done = ato_hil("run", "line", option, value, "--out", "o", cwd=tmp_path)
     assert done.returncode == 1
-    assert done.stderr.strip() == ("ato-hil: m.bin: a memory file is for one train, not for a line")
+    assert done.stderr.strip() == f"ato-hil: line: a line of several trains takes no {what}"
 
 
 def controllers(process: subprocess.Popen[str]) -> list[int]:
