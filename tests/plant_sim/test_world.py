@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plant_sim import actuator, plant, world
+from plant_sim import actuator, world
 from plant_sim.scenario import load
 
 NOISE = "[sensors]\nspeed_noise_m_s = 0.005\n"
