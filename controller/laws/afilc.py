@@ -71,7 +71,9 @@ PARAMS = np.dtype(
     align=True,
 )
 
-STATE = np.dtype([("delta", np.int32, (RULES,)), ("alpha", np.int32)], align=True)
+STATE = np.dtype(
+    [("delta", np.int32, (RULES,)), ("alpha", np.int32), ("padding", np.int32)], align=True
+)
 
 # Learned words: name, unit, Q.
 WORDS = (

@@ -41,7 +41,13 @@ PARAMS = np.dtype(
 
 LEARNED_MAX = 8 << 27  # of u - u_0, m/s^2, Q27: an increment from bound to bound fits the format
 
-STATE = np.dtype([("increment", np.int32)], align=True)  # of the last tick, m/s^2, Q27
+STATE = np.dtype(
+    [
+        ("increment", np.int32),  # of the last tick, m/s^2, Q27
+        ("padding", np.int32),
+    ],
+    align=True,
+)
 
 # Learned words: name, unit, Q.
 WORDS = (("u - u_0", "m/s^2", 27),)

@@ -257,7 +257,7 @@ def test_words_that_are_not_stored_keep_their_first_value():
 def test_a_law_without_words_uses_no_memory():
     mine = Memory(settings_of(words=0, cells=0))
     assert mine.stored.size == 0
-    cell = np.full(1, 7, np.int32).repeat(2 * WORDS_MAX).view(CELL)
+    cell = np.full(CELL.itemsize // 4, 7, np.int32).view(CELL)
     memory.gather(mine.params[0], mine.state[0], mine.stored, cell[0])
     memory.scatter(mine.params[0], mine.state[0], mine.stored, cell[0])
     memory.end_run(mine.params[0], mine.state[0], mine.stored, True)
