@@ -28,7 +28,7 @@ from can_dbc.codec import (
     mailboxes,
     put,
 )
-from controller import calibration, node, store
+from controller import calibration, firmware, node, store
 from controller.calibration import GuardSettings, Line, MemorySettings
 from controller.interface import (
     ARMED,
@@ -57,6 +57,7 @@ from controller.neighbours import NeighbourSettings
 from controller.quantise import Vehicle
 from controller.rebasing import RebasingSettings
 from controller.reference import SEGMENT
+from controller.registry import law_names, load_law
 
 MASS_KG = 200_000.0
 AGE_MAX = 5
@@ -722,6 +723,25 @@ def test_a_new_run_forgets_the_line(on_a_line):
     told = radio(stand(on_a_line))
     assert set(told.values()) == {0}
     assert on_a_line.inputs["neighbour"].tolist() == [0, 0]
+
+
+# Records.
+
+
+def fields_bytes(dtype):
+    """Bytes of all fields of a record, without what lies between them."""
+    if dtype.subdtype:
+        return fields_bytes(dtype.subdtype[0]) * int(np.prod(dtype.subdtype[1]))
+    if dtype.names is None:
+        return dtype.itemsize
+    return sum(fields_bytes(dtype[name]) for name in dtype.names)
+
+
+@pytest.mark.parametrize("law", law_names())
+def test_the_records_around_a_law_have_no_hidden_padding(law):
+    module = load_law(law)
+    for dtype in (firmware.params_dtype(module.PARAMS), firmware.state_dtype(module.STATE)):
+        assert fields_bytes(dtype) == dtype.itemsize
 
 
 # Garbage.

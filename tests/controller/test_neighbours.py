@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from can_dbc.codec import (
@@ -129,6 +129,7 @@ class Train:
         return row["distance"][side] / 2**15, row["closing"][side] / 2**24
 
 
+@settings(max_examples=30)
 @given(
     st.integers(0, AGE_MAX), st.floats(-3, 3), st.floats(-1, 1), st.sampled_from([AHEAD, BEHIND])
 )

@@ -217,9 +217,11 @@ def _pid_force(p: Any, state: Any, inputs: Any) -> Any:
 
 _PID = recorded(("Kp", "Ki", "Kd", "force_max"), _pid_values)
 
-# Bounds: 20 N of a 200 t train is 1e-4 m/s^2, twice what barrier and separation round to.
+# Bounds: twice what five trains on `line` give (2.2 N, 3.3 um, 4.6 um/s), all laws.
+BOUNDS = 5.0, 7e-6, 1e-5
+
 REFERENCES: dict[str, Reference] = {
-    "mtcc": Reference(_mtcc_params, OWN, _mtcc_force, 20.0, 2e-5, 5e-5),
-    "mtcc-single": Reference(_single_params, OWN, _single_force, 20.0, 2e-5, 5e-5),
-    "mtcc-pid": Reference(_PID, PID_OWN, _pid_force, 20.0, 2e-5, 5e-5),
+    "mtcc": Reference(_mtcc_params, OWN, _mtcc_force, *BOUNDS),
+    "mtcc-single": Reference(_single_params, OWN, _single_force, *BOUNDS),
+    "mtcc-pid": Reference(_PID, PID_OWN, _pid_force, *BOUNDS),
 }
