@@ -12,16 +12,17 @@ PYTHON ?= python3
 SCENARIO ?= subway
 RUNS ?= 10
 PYTEST_ARGS ?=
+GUEST_LIMIT_S ?= 1200
 
 RUN_READY := .venv/run.ready
 DEV_READY := .venv/dev.ready
 COMPILE := .venv/bin/python -m uv pip compile pyproject.toml --universal --generate-hashes --group build \
 	--no-header --no-annotate --no-emit-index-url --quiet
 
-.PHONY: help hil test long verify golden lint types lock clean
+.PHONY: help hil test long test-socketcan verify golden pareto lint types lock clean
 
 help: ## list the targets
-	sed -nE 's/^([a-z]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 14
+	sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 23
 
 hil: $(RUN_READY) ## set up and run the main job: SCENARIO=subway RUNS=10, traces in runs/
 	.venv/bin/ato-hil run "$(SCENARIO)" --mode hil --runs "$(RUNS)" --out "runs/$(SCENARIO)"
@@ -35,11 +36,25 @@ test: $(DEV_READY) ## set up and pass the fast tests
 long: $(DEV_READY) ## pass the long tests
 	.venv/bin/python -m pytest -q -m "long and not pil and not uml" $(PYTEST_ARGS)
 
+# The guest is slow: what it runs is compiled here first.
+test-socketcan: $(DEV_READY) ## pass the tests on SocketCAN, in user-mode Linux, and measure it there
+	$(install_guest)
+	.venv/bin/ato-hil run tests/uml/short.toml --bus hub:uml --out runs/test-socketcan
+	.venv/bin/python tests/python_can_tests.py runs/test-socketcan
+	.venv/bin/python tests/uml/guest.py --limit $(GUEST_LIMIT_S) \
+		.venv/bin/python -m pytest -v -p no:cacheprovider -m uml $(PYTEST_ARGS) tests/uml
+	.venv/bin/python tests/uml/guest.py --limit $(GUEST_LIMIT_S) .venv/bin/ato-hil bench \
+		--no-sessions --bus socketcan:vcan0 --bus vcan --bus hub:uml
+
 verify: $(RUN_READY) ## check every promise of the firmware: LAWS="cailc pid", all by default
 	.venv/bin/ato-hil verify $(LAWS)
 
 golden: $(RUN_READY) ## write new golden digests (tools/verify/golden.json) and say what changed
 	.venv/bin/ato-hil verify --renew-golden $(LAWS)
+
+pareto: $(RUN_READY) ## draw docs/pareto.png again: energy against error in paper 5
+	.venv/bin/ato-hil sweep gradient-paper:VI --vary law.L=1,5 --vary law.S=0,0.1,0.25,0.5,1,2,4 --out runs/pareto
+	cp runs/pareto/pareto.png docs/pareto.png
 
 lint: $(DEV_READY) ## ruff: lint and format
 	.venv/bin/python -m ruff check .
@@ -65,6 +80,24 @@ $(RUN_READY): pyproject.toml requirements.lock
 $(DEV_READY): pyproject.toml requirements-dev.lock
 	$(call set_up,requirements-dev.lock)
 	touch $(RUN_READY) $@
+
+define install_guest
+missing=
+command -v linux.uml >/dev/null || missing+=" user-mode-linux"
+PATH=$$PATH:/usr/sbin:/sbin command -v insmod >/dev/null || missing+=" kmod"
+PATH=$$PATH:/usr/sbin:/sbin command -v ip >/dev/null || missing+=" iproute2"
+echo "#include <elf.h>" | gcc -E - >/dev/null 2>&1 || missing+=" gcc libc6-dev"
+if [ -n "$$missing" ]; then
+	if [ "$$(id -u)" != 0 ] || ! command -v apt-get >/dev/null; then
+		echo "Packages of Debian are missing (on x86-64 only). Install them, then run make again:" \
+			"sudo apt-get install -y$$missing" >&2
+		exit 1
+	fi
+	echo "Installing$$missing"
+	apt-get update -qq
+	DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing >/dev/null
+fi
+endef
 
 define set_up
 if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then

@@ -2,9 +2,9 @@
 
 | name | bus |
 | --- | --- |
-| `auto` | vcan0 where it exists, else a private vcan, else the embedded hub |
+| `auto` | vcan0 where it exists, else a private vcan with ample buffers, else the embedded hub |
 | `hub`, `hub:CHANNEL` | the embedded hub (`can_dbc.hub`); the default channel is vcan0 |
-| `vcan` | a private vcan in a network namespace of its own |
+| `vcan`, `vcan:CHANNEL` | a private vcan in a network namespace of its own (`can_dbc.socketcan`) |
 | `socketcan:NAME` | the network interface NAME of the Linux kernel |
 | `INTERFACE:CHANNEL` | any other interface of python-can |
 
@@ -15,15 +15,18 @@ little-endian signed 64-bit integer.
 import errno
 import os
 import socket
-from collections.abc import Sequence
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import can
 
+from can_dbc import private_vcan_server
 from can_dbc.hub import DEFAULT_CHANNEL, FOREIGN, HubBus
 from can_dbc.hub_server import ERROR, EXTENDED, REMOTE
+from can_dbc.socketcan import FRAME_COST_BYTES, PrivateVcanBus, SocketBus, receive_buffer_bytes
 
 __all__ = [
     "FOREIGN",
@@ -34,16 +37,26 @@ __all__ = [
     "private_vcan_reason",
     "recv_frames",
     "send_frames",
+    "small_buffer_reason",
     "socketcan_reason",
 ]
 
-EXPECTED = "expected auto, hub, hub:CHANNEL, vcan, socketcan:NAME or INTERFACE:CHANNEL"
+EXPECTED = (
+    "expected auto, hub, vcan, hub:CHANNEL, vcan:CHANNEL, socketcan:NAME or INTERFACE:CHANNEL"
+)
 
-_HUB_INTERFACE = "atohub"
-_SO_RCVBUFFORCE = 33  # asm-generic/socket.h; not in the socket module
-# The kernel's default loses all but the first 278 frames of a burst; this holds some 80 000.
-_RECEIVE_BUFFER_BYTES = 64 << 20
-_SEND_TIMEOUT_S = 1.0  # socketcan: how long a full transmit queue may stay full
+# Our own interfaces of python-can, the short names for their buses, and how they are opened.
+_SHORT = {"atohub": "hub", "atovcan": "vcan"}
+_LONG = {short: interface for interface, short in _SHORT.items()}
+_OPEN: dict[str, Callable[..., can.BusABC]] = {
+    "atohub": HubBus,
+    "atovcan": PrivateVcanBus,
+    "socketcan": SocketBus,
+}
+
+_SEND_TIMEOUT_S = 1.0  # how long a full transmit queue may stay full
+_TRIAL_TIMEOUT_S = 30.0
+_AMPLE_BUFFER_BYTES = 8 << 20  # some 11 000 frames; recent kernels (6.18) give it to everybody
 _MAX_FRAMES = 1024  # per call of recv_frames, so that it returns under any load
 
 
@@ -62,8 +75,7 @@ class BusChoice:
     @property
     def name(self) -> str:
         """The name under which other processes open the same bus."""
-        interface = "hub" if self.interface == _HUB_INTERFACE else self.interface
-        return f"{interface}:{self.channel}"
+        return f"{_SHORT.get(self.interface, self.interface)}:{self.channel}"
 
 
 def open_bus(name: str, **kwargs: Any) -> can.BusABC:
@@ -74,16 +86,13 @@ def open_bus(name: str, **kwargs: Any) -> can.BusABC:
     """
     choice = choose_bus(name)
     try:
-        if choice.interface == _HUB_INTERFACE:
-            return HubBus(choice.channel, **kwargs)
+        if own := _OPEN.get(choice.interface):
+            return own(choice.channel, **kwargs)
         # Without ignore_config, ~/.canrc or ./can.ini could put us on another bus.
-        bus = can.Bus(choice.channel, choice.interface, ignore_config=True, **kwargs)
+        return can.Bus(choice.channel, choice.interface, ignore_config=True, **kwargs)
     except Exception as error:  # vendors' drivers raise what they like
         reason = " ".join(str(error).split()) or type(error).__name__
         raise BusError(f"bus {name!r}: cannot open {choice.name}: {reason}") from error
-    if choice.interface == "socketcan":
-        _enlarge_receive_buffer(bus)
-    return bus
 
 
 def choose_bus(name: str) -> BusChoice:
@@ -93,30 +102,56 @@ def choose_bus(name: str) -> BusChoice:
     """
     if name == "auto":
         return _best_bus()
-    if name == "vcan":
-        raise BusError(f"bus 'vcan': cannot have a private vcan: {private_vcan_reason()}")
-    if name == "hub":
-        return BusChoice(_HUB_INTERFACE, DEFAULT_CHANNEL, "asked for")
-    interface, _, channel = name.partition(":")
+    interface, colon, channel = name.partition(":")
+    if interface in _LONG and not colon:
+        channel = DEFAULT_CHANNEL
     if not interface or not channel:
         raise BusError(f"bus {name!r}: {EXPECTED}")
-    if interface in ("hub", _HUB_INTERFACE):
-        return BusChoice(_HUB_INTERFACE, channel, "asked for")
+    interface = _LONG.get(interface, interface)
+    if interface == "atovcan" and (reason := socketcan_reason("")):
+        raise BusError(f"bus {name!r}: cannot have a private vcan: {reason}")
+    if interface == "atovcan":
+        return BusChoice(interface, channel, _with_buffer("asked for"))
+    if interface == "atohub":
+        return BusChoice(interface, channel, "asked for")
     if interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         raise BusError(f"bus {name!r}: unknown interface {interface!r}, expected hub or {known}")
-    if interface == "socketcan" and (reason := socketcan_reason(channel)):
-        raise BusError(f"bus {name!r}: {reason}")
+    if interface == "socketcan":
+        if reason := socketcan_reason(channel):
+            raise BusError(f"bus {name!r}: {reason}")
+        return BusChoice(interface, channel, _with_buffer("asked for"))
     return BusChoice(interface, channel, "asked for")
 
 
 def _best_bus() -> BusChoice:
     no_vcan0 = socketcan_reason(DEFAULT_CHANNEL)
     if not no_vcan0:
-        return BusChoice("socketcan", DEFAULT_CHANNEL, f"{DEFAULT_CHANNEL} exists")
-    no_private_vcan = private_vcan_reason()
+        return BusChoice("socketcan", DEFAULT_CHANNEL, _with_buffer(f"{DEFAULT_CHANNEL} exists"))
+    no_private_vcan = private_vcan_reason() or small_buffer_reason()
+    if not no_private_vcan:
+        return BusChoice("atovcan", DEFAULT_CHANNEL, f"a private one; {no_vcan0}")
     reasons = dict.fromkeys((no_vcan0, no_private_vcan))
-    return BusChoice(_HUB_INTERFACE, DEFAULT_CHANNEL, "; ".join(reasons))
+    return BusChoice("atohub", DEFAULT_CHANNEL, "; ".join(reasons))
+
+
+def _with_buffer(reason: str) -> str:
+    return "; ".join(filter(None, (reason, small_buffer_reason())))
+
+
+def small_buffer_reason() -> str:
+    """Why nodes on the kernel's buses lose frames when they are held up; empty where they do not.
+
+    The recorder of a lockstep run at full speed was seen to lag by some 2700 frames on a machine
+    with more work than cores. The hub keeps 100 000.
+    """
+    size = receive_buffer_bytes()
+    if size >= _AMPLE_BUFFER_BYTES:
+        return ""
+    return (
+        f"the kernel keeps only {size // FRAME_COST_BYTES} frames for a node that lags,"
+        f" try: sudo sysctl net.core.rmem_max={_AMPLE_BUFFER_BYTES}"
+    )
 
 
 def socketcan_reason(channel: str) -> str:
@@ -142,24 +177,23 @@ def socketcan_reason(channel: str) -> str:
 
 
 def private_vcan_reason() -> str:
-    """Why this machine cannot have a private vcan."""
-    # The address family alone says enough: interface 0, all of them, can be bound everywhere.
+    """Why this machine cannot have a private vcan; empty when it can. Makes one to see."""
+    # The address family says enough on most machines: all interfaces can be bound everywhere.
     if reason := socketcan_reason(""):
         return reason
-    release = Path("/lib/modules", os.uname().release)
-    lists = [release / "modules.dep", release / "modules.builtin"]
-    known = any(each.exists() and "/vcan.ko" in each.read_text() for each in lists)
-    if not known and not Path("/sys/module/vcan").exists():
-        return "this kernel has no module vcan"
-    return "this version makes no network namespace for its nodes"
-
-
-def _enlarge_receive_buffer(bus: Any) -> None:
-    """Let a node that was not scheduled for a while find all frames of that time."""
     try:
-        bus.socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER_BYTES)
-    except OSError:  # only root may go beyond net.core.rmem_max
-        bus.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+        tried = subprocess.run(
+            [sys.executable, "-I", "-S", private_vcan_server.__file__],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_TRIAL_TIMEOUT_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"cannot try: {error}"
+    lines = tried.stderr.strip().splitlines() or [f"exit code {tried.returncode}"]
+    return lines[-1] if tried.returncode else ""
 
 
 def send_frames(bus: can.BusABC, frames: Sequence[tuple[int, int]]) -> None:

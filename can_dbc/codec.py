@@ -119,7 +119,10 @@ def _message(index: int, name: str, needed: tuple[str, ...]) -> Any:
         "cycle_ms": source.cycle_time or 0,
         **signals,
     }
-    return namedtuple(name, fields)(**fields)
+    # The compiler's cache knows a class again only if it can be imported by name.
+    class_name = f"{name}_LAYOUT"
+    globals()[class_name] = namedtuple(class_name, fields)
+    return globals()[class_name](**fields)
 
 
 MESSAGES: tuple[Any, ...] = tuple(

@@ -3,35 +3,23 @@
 The processes of one user that open the same channel exchange frames with the semantics of a Linux
 vcan interface, where the kernel has none. The first node starts the hub process
 (`can_dbc.hub_server`, which also describes the protocol), the last one to leave ends it.
-
-The sockets live in a directory that only its owner can enter: `$XDG_RUNTIME_DIR/ato-hil`, else
-`ato-hil-UID` in the folder for temporary files. A lock on that directory itself makes the election
-of a hub free of races; there are no lock files.
 """
 
 import contextlib
-import fcntl
 import json
 import logging
 import os
-import re
 import select
 import socket
-import stat
 import struct
-import subprocess
-import sys
-import tempfile
 import threading
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import can
 from can.typechecking import CanFilters
 
-from can_dbc import hub_server
+from can_dbc import hub_server, rendezvous
 from can_dbc.hub_server import (
     BITRATE_SWITCH,
     ERROR,
@@ -49,6 +37,7 @@ from can_dbc.hub_server import (
 )
 
 DEFAULT_CHANNEL = "vcan0"
+SERVER = rendezvous.Server("atohub", "hub", f".v{PROTOCOL}.sock", hub_server)
 
 #: Set in the identifiers that `recv_frames` gives to all but standard data frames of 8 bytes.
 FOREIGN = 1 << 32
@@ -56,8 +45,6 @@ FOREIGN = 1 << 32
 _LOG = logging.getLogger(__name__)
 
 _READ_BYTES = 1 << 16
-_CONNECT_TIMEOUT_S = 10.0  # many nodes that start at once on a loaded machine take half a second
-_MAX_PATH_BYTES = 103  # sockaddr_un holds 104 bytes on macOS, 108 on Linux, with the final zero
 
 # A frame of `send_frames` and `recv_frames`: identifier, length and flags as one word, then the
 # payload as one signed word. A standard data frame of 8 bytes is (identifier | _MAILBOX, payload).
@@ -108,7 +95,9 @@ class HubBus(can.BusABC):
         self._hub_filters = _filter_words(can_filters)
         self._path = socket_path(self.channel)
         request = {"fd": fd, "own": receive_own_messages, "filters": self._hub_filters}
-        self._socket, answer, self._received = _join(self._path, request)
+        self._socket, answer, self._received = rendezvous.join(
+            SERVER, self._path, lambda path: _ask(path, request)
+        )
         self._number: int = answer["node"]
         #: Process of the hub.
         self.hub_pid: int = answer["pid"]
@@ -188,9 +177,7 @@ class HubBus(can.BusABC):
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that still receives
         self._socket.close()
-        # The hub deletes its socket itself, unless it was killed.
-        with contextlib.suppress(OSError), _directory_lock(self._path.parent):
-            _remove_stale_socket(self._path)
+        rendezvous.leave(self._path)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if not self._fill(timeout):
@@ -292,40 +279,8 @@ class HubBus(can.BusABC):
 
 
 def socket_path(channel: str) -> Path:
-    """The socket of a channel; makes the directory that it is in.
-
-    :raises ValueError: the channel is not a possible name.
-    :raises can.CanInitializationError: the directory belongs to somebody else or is open to
-        others, or its path is too long for a socket.
-    """
-    if not re.fullmatch(r"[A-Za-z0-9_.-]+", channel):
-        raise ValueError(f"atohub: channel {channel!r}: expected letters, digits, '_', '.' and '-'")
-    path = _socket_directory() / f"{channel}.v{PROTOCOL}.sock"
-    if len(os.fsencode(path)) > _MAX_PATH_BYTES:
-        raise can.CanInitializationError(
-            f"atohub: socket path {path} is longer than {_MAX_PATH_BYTES} bytes: "
-            "set XDG_RUNTIME_DIR or TMPDIR to a shorter directory, or shorten the channel"
-        )
-    return path
-
-
-def _socket_directory() -> Path:
-    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    if os.path.isabs(runtime) and os.path.isdir(runtime):
-        directory = Path(runtime, "ato-hil")
-    else:
-        directory = Path(tempfile.gettempdir(), f"ato-hil-{os.getuid()}")
-    try:
-        with contextlib.suppress(FileExistsError):
-            directory.mkdir(mode=0o700)
-        status = directory.lstat()  # a link into a directory of ours could be anybody's
-    except OSError as error:
-        raise can.CanInitializationError(f"atohub: {directory}: {error.strerror}") from error
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
-        raise can.CanInitializationError(
-            f"atohub: {directory}: expected a directory of user {os.getuid()} with mode 0700"
-        )
-    return directory
+    """The socket of a channel; makes the directory that it is in. Raises as `rendezvous` does."""
+    return rendezvous.socket_path(SERVER, channel)
 
 
 def _filter_words(filters: CanFilters | None) -> list[tuple[int, int]]:
@@ -344,32 +299,11 @@ def _filter_words(filters: CanFilters | None) -> list[tuple[int, int]]:
     return words
 
 
-def _join(path: Path, request: dict[str, Any]) -> tuple[socket.socket, dict[str, int], bytes]:
-    """Connect to the hub as a node, starting a hub if there is none; returns as `_ask`."""
-    deadline = time.monotonic() + _CONNECT_TIMEOUT_S
-    while True:
-        try:
-            try:
-                return _ask(path, request)
-            except (FileNotFoundError, ConnectionRefusedError):
-                _start_hub(path)
-        except ConnectionError as error:
-            # It was just leaving: try again.
-            if time.monotonic() > deadline:
-                raise can.CanInitializationError(f"atohub: the hub at {path} hangs up") from error
-        except TimeoutError as error:
-            raise can.CanInitializationError(
-                f"atohub: the hub at {path} does not answer within {_CONNECT_TIMEOUT_S:g} s"
-            ) from error
-        except OSError as error:
-            raise can.CanInitializationError(f"atohub: {path}: {error.strerror}") from error
-
-
 def _ask(path: Path, request: dict[str, Any]) -> tuple[socket.socket, dict[str, int], bytes]:
     """Open a connection with a request; returns it, the answer, and what came after the answer."""
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        connection.settimeout(_CONNECT_TIMEOUT_S)
+        connection.settimeout(rendezvous.CONNECT_TIMEOUT_S)
         connection.connect(os.fspath(path))
         connection.sendall(json.dumps(request).encode() + b"\n")
         received = b""
@@ -384,68 +318,6 @@ def _ask(path: Path, request: dict[str, Any]) -> tuple[socket.socket, dict[str, 
         raise
     answer, _, rest = received.partition(b"\n")
     return connection, json.loads(answer), rest
-
-
-def _start_hub(path: Path) -> None:
-    """Start the hub of a channel, unless somebody else just did.
-
-    The socket listens before the process runs: whoever connects meanwhile only waits.
-    """
-    with _directory_lock(path.parent):
-        if not _remove_stale_socket(path):
-            return
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            listener.bind(os.fspath(path))
-            path.chmod(0o600)
-            listener.listen(128)
-            # Its own session, so that Ctrl-C in a terminal does not reach it. It forks and lets
-            # this process go on, so there is no child to wait for later. By file name and without
-            # site packages, because that starts faster and works from any directory.
-            command = [sys.executable, "-I", "-S", hub_server.__file__, os.fspath(path)]
-            done = subprocess.run(
-                command,
-                stdin=listener.fileno(),
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                start_new_session=True,
-                check=False,
-            )
-        except OSError as error:
-            path.unlink(missing_ok=True)
-            raise can.CanInitializationError(f"atohub: cannot start a hub: {error}") from error
-        finally:
-            listener.close()
-        if done.returncode:
-            path.unlink(missing_ok=True)
-            lines = done.stderr.decode(errors="replace").strip().splitlines()
-            reason = lines[-1] if lines else f"exit code {done.returncode}"
-            raise can.CanInitializationError(f"atohub: cannot start a hub: {reason}")
-
-
-def _remove_stale_socket(path: Path) -> bool:
-    """Delete a socket that nobody listens to; False when a hub does. Needs the directory's lock."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(_CONNECT_TIMEOUT_S)
-        try:
-            probe.connect(os.fspath(path))
-        except (FileNotFoundError, ConnectionRefusedError):
-            path.unlink(missing_ok=True)
-            return True
-        except OSError:
-            return False  # connecting again tells the user what is wrong
-    return False
-
-
-@contextlib.contextmanager
-def _directory_lock(directory: Path) -> Iterator[None]:
-    """Hold the lock under which hubs are elected; it vanishes with the process that holds it."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _writable(connection: socket.socket, timeout: float) -> bool:

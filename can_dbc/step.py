@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core.caching import FunctionCache
 
 INTERPRETED = os.environ.get("ATO_HIL_INTERPRETED") == "1"
 # Each package and what it may import: a step compiles these sources in.
@@ -129,10 +130,23 @@ def _stable_identity(function: Any) -> str:
     """A name that is equal in every process: numba's own is random, and closures over steps would
     miss the cache."""
     source = inspect.getsourcefile(function) or ""
-    parts = [function.__module__, function.__qualname__, _file_digest(source)]
+    sources = source_digest(function.__module__.partition(".")[0])
+    parts = [function.__module__, function.__qualname__, _file_digest(source), sources]
     for cell in function.__closure__ or ():
         parts.append(str(getattr(cell.cell_contents, "_uuid", cell.cell_contents)))
     return hashlib.blake2b("|".join(parts).encode(), digest_size=16).hexdigest()
+
+
+class _StepCache(FunctionCache):
+    """numba's, keyed by identity: numba keys a closure by its pickle, which has random parts where
+    the steps inside name a class made at run time, as the codec's messages are."""
+
+    def __init__(self, function: Any, identity: str) -> None:
+        super().__init__(function)
+        self._identity = identity
+
+    def _index_key(self, signature: Any, codegen: Any) -> Any:
+        return signature, codegen.magic_tuple(), self._identity
 
 
 def step(function: Any) -> Any:
@@ -143,5 +157,7 @@ def step(function: Any) -> Any:
     compiled = numba.njit(
         nogil=True, error_model="numpy", cache=True, boundscheck=False, _nrt=False
     )(function)
-    compiled._set_uuid(_stable_identity(function))
+    identity = _stable_identity(function)
+    compiled._set_uuid(identity)
+    compiled._cache = _StepCache(function, identity)
     return compiled

@@ -29,7 +29,7 @@ from controller import (
     reference,
 )
 from controller.q import Q_ACCELERATION, Q_FORCE, Q_SPEED
-from controller.quantise import CalibrationError, Vehicle, fixed
+from controller.quantise import CalibrationError, Recall, Vehicle, fixed
 from controller.registry import law_label, law_number, load_law
 
 FORMAT = "ato-hil calibration 1"
@@ -37,7 +37,8 @@ AGE_MAX_TICKS = 1000
 
 
 class MemorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Grid of the learning memory."""
+    """Grid of the learning memory; a law that recalls the last run has one int32 cell a tick,
+    whatever this says."""
 
     decimation: int = 1  # control periods a cell
     lead_ticks: int = 0
@@ -102,15 +103,21 @@ def calibrate(
         typed = msgspec.convert(gains, module.Gains)
         params["law"] = module.calibrate(typed, vehicle)
         words = _words(module, typed, vehicle)
+        recall = module.recall(typed) if hasattr(module, "recall") else None
     except (msgspec.ValidationError, CalibrationError) as error:
         raise CalibrationError(f"laws.{law_label(law)}: {error}") from None
     params["gradient_map"] = gradient_map.calibrate(map_sections)
     params["guard"] = _guard(guard_settings)
-    params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
     if line is not None:
         _line(params, line, vehicle.period_s)
     ticks = int(profile["ticks"].sum()) + 1
+    if recall is not None:
+        preview_ticks = recall.ahead_ticks
+        memory_settings = MemorySettings()
+    params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
     params["memory"] = _memory(words, memory_settings, ticks)
+    if recall is not None:
+        _recall(params["memory"], recall)
     if car_effectiveness:
         try:
             params["distribution"] = distribution.calibrate(
@@ -223,6 +230,16 @@ def _memory(params: np.ndarray, settings: MemorySettings, ticks: int) -> np.ndar
     params["weight"] = round(2**30 / (2 * decimation))
     params["scale"] = 1 if settings.storage == "int32" else 2**16
     return params
+
+
+def _recall(params: np.ndarray, recall: Recall) -> None:
+    """Adds to the params of `_memory` what a law sees of the last run."""
+    params["recall"] = 1
+    params["ahead"] = recall.ahead_ticks
+    params["smooth"] = recall.smooth_ticks
+    params["smooth_word"] = recall.smooth_word
+    params["smooth_weight"] = round(2**30 / (2 * recall.smooth_ticks + 1))
+    params["late_word"] = recall.late_word
 
 
 def save(calibration: Calibration, path: Path) -> None:

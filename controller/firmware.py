@@ -201,7 +201,7 @@ def send(core: Any, tx: Any, message: Any, word: Any) -> None:
 
 
 @step
-def begin(params: Any, profile: Any, state: Any) -> None:
+def begin(params: Any, profile: Any, state: Any, cells: Any) -> None:
     """State of a new run: reference at its start, counters at 0, no fault; the learning memory
     stays."""
     core = state.core
@@ -225,7 +225,7 @@ def begin(params: Any, profile: Any, state: Any) -> None:
             reference.advance(params.reference, state.ahead, profile)
     neighbours.begin(state.neighbours)
     rebasing.begin(state.rebasing)
-    memory.rewind(params.memory, state.memory, state.cell)
+    memory.rewind(params.memory, state.memory, cells, state.cell)
     state.inputs.limited = 0
 
 
@@ -511,7 +511,7 @@ def build_tick(law_step: Any) -> Any:
                 core.run_state = wanted
                 core.iteration = get(word, RUN_CTRL.Iteration)
                 if wanted == ARMED:
-                    begin(params, profile, state)
+                    begin(params, profile, state, cells)
                 send(core, tx, ATO_STATUS, status_word(params, core))
         if int64(core.run_state) == RUNNING and period == 1:
             read_inputs(state, rx)

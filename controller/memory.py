@@ -8,6 +8,10 @@ of `learn` over the cell's ticks, added once to what the cell held, and clamped;
 `lead` ticks earlier than it was measured, which is what keeps learning stable when the actuator
 lags.
 
+A law may instead recall the last run (`Recall`): each tick's `learn` then replaces what the cell
+held, one cell a tick, and the law sees besides `before` the first words of a later tick (`ahead`)
+and a zero-phase moving average of one word (`smooth`), both of the last run throughout.
+
 Contract: `gather` and `scatter` are steps of bounded time that run inside the tick; `start_run`,
 `end_run` run between runs. The caller owns every buffer.
 """
@@ -21,12 +25,17 @@ import numpy as np
 from can_dbc.step import int64, step
 from controller.q import INT32_MAX, clamp, divide_round, round_shift, sat32
 
-WORDS_MAX = 8
+WORDS_MAX = 22
+AHEAD_WORDS = 2
+SMOOTH_MAX = 64  # ticks either side
 
 CELL = np.dtype(
     [
         ("before", np.int32, (WORDS_MAX,)),  # in: value that the previous runs left for this tick
-        ("learn", np.int32, (WORDS_MAX,)),  # out: increment that this tick asks for
+        ("learn", np.int32, (WORDS_MAX,)),  # out: increment that this tick asks for; recall: value
+        ("ahead", np.int32, (AHEAD_WORDS,)),  # in, recall: first words of a later tick
+        ("smooth", np.int32),  # in, recall: mean of a word over the ticks around this one
+        ("padding", np.int32),
     ],
     align=True,
 )
@@ -40,6 +49,12 @@ MEMORY_PARAMS = np.dtype(
         ("linear", np.int32),  # 1: interpolate between cell centres, 0: hold
         ("weight", np.int32),  # 2^30 / (2 * decimation)
         ("scale", np.int32),  # value of one stored unit: 1, or a power of two for int16 storage
+        ("recall", np.int32),  # 1: `learn` replaces what the cell held
+        ("ahead", np.int32),  # recall: ticks from now to the cell in `ahead`
+        ("smooth", np.int32),  # recall: ticks either side that `smooth` averages, 0..SMOOTH_MAX
+        ("smooth_word", np.int32),  # recall: the word that it averages
+        ("smooth_weight", np.int32),  # 2^30 / (2 smooth + 1)
+        ("late_word", np.int32),  # recall: words from here on are of the tick before
         ("padding", np.int32),
         ("low", np.int32, (WORDS_MAX,)),  # bounds of a value
         ("high", np.int32, (WORDS_MAX,)),
@@ -51,6 +66,7 @@ MEMORY_PARAMS = np.dtype(
 MEMORY_STATE = np.dtype(
     [
         ("total", np.int64, (WORDS_MAX,)),  # of `learn` over the ticks of the open cell
+        ("window", np.int64),  # recall: sum of the word that is averaged
         ("generation", np.int32),  # which half is read, 0 or 1
         ("read_cell", np.int32),
         ("read_phase", np.int32),  # tick inside the cell that is read
@@ -63,7 +79,7 @@ MEMORY_STATE = np.dtype(
 
 
 @step
-def rewind(params: Any, state: Any, cell: Any) -> None:
+def rewind(params: Any, state: Any, memory: Any, cell: Any) -> None:
     """The state at the start of a run; the generation stays. Words that are not stored are at their
     initial value throughout."""
     for w in range(WORDS_MAX):
@@ -74,6 +90,38 @@ def rewind(params: Any, state: Any, cell: Any) -> None:
     state.write_cell = 0
     state.write_phase = 0
     state.wait = params.lead
+    if int64(params.recall) == 1:
+        # Before tick 0 the first cell counts as many times as the window is wide.
+        first = int64(memory[int64(state.generation), 0, int64(params.smooth_word)])
+        state.window = (2 * int64(params.smooth) + 1) * first
+        for k in range(1, SMOOTH_MAX):
+            if k < int64(params.smooth):
+                slide(params, state, memory, k - int64(params.smooth))
+
+
+@step
+def slide(params: Any, state: Any, memory: Any, here: Any) -> None:
+    """Moves the window of the moving average from cell `here` - 1 to `here`; beyond both ends the
+    first and the last cell go on."""
+    generation = int64(state.generation)
+    word = int64(params.smooth_word)
+    half = int64(params.smooth)
+    last = int64(params.cells) - 1
+    enters = int64(memory[generation, clamp(here + half, int64(0), last), word])
+    leaves = int64(memory[generation, clamp(here - 1 - half, int64(0), last), word])
+    state.window = int64(state.window) + enters - leaves
+
+
+@step
+def recall(params: Any, state: Any, memory: Any, cell: Any) -> None:
+    """`cell.ahead` and `cell.smooth` for the current tick."""
+    here = int64(state.read_cell)
+    later = min(here + int64(params.ahead), int64(params.cells) - 1)
+    for w in range(AHEAD_WORDS):
+        cell.ahead[w] = memory[int64(state.generation), later, w]
+    slide(params, state, memory, here)
+    # |window| <= 2^31 (2 smooth + 1): the product stays below 2^62.
+    cell.smooth = sat32(round_shift(int64(state.window) * int64(params.smooth_weight), 30))
 
 
 @step
@@ -102,6 +150,8 @@ def gather(params: Any, state: Any, memory: Any, cell: Any) -> None:
                 far = int64(memory[generation, neighbour, w])
                 value = near + round_shift((far - near) * weight, 30)
                 cell.before[w] = sat32(value * scale)
+        if int64(params.recall) == 1:
+            recall(params, state, memory, cell)
         phase += 1
         if phase >= decimation:
             phase = int64(0)
@@ -140,11 +190,16 @@ def close_cell(params: Any, state: Any, memory: Any) -> None:
                 total = int64(state.total[w])
                 mean = total if ticks == 1 else divide_round(total, ticks)
                 before = int64(memory[read, here, w]) * scale
+                there = here
+                if int64(params.recall) == 1:
+                    before = int64(0)
+                    if w >= int64(params.late_word):
+                        there = max(here - 1, int64(0))  # that of tick 0 is replaced by tick 1
                 value = clamp(before + mean, int64(params.low[w]), int64(params.high[w]))
                 if scale != 1:
                     highest = INT32_MAX // max(scale, int64(1))
                     value = min(divide_round(value, scale), highest)  # rounds up to 2^15
-                memory[1 - read, here, w] = value
+                memory[1 - read, there, w] = value
                 state.total[w] = 0
         state.write_phase = 0
         state.write_cell = here + 1

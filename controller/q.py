@@ -70,3 +70,37 @@ def sin_half_pi(s: Any) -> Any:
     series = _SIN_3 + ((series * square) >> 30)
     series = _SIN_1 + ((series * square) >> 30)
     return round_shift(series * s, 28)
+
+
+# (2^-f - 1) / f on (0, 1] as a minimax polynomial in f, Q30: 2^-f is within 1.5e-9.
+_EXP2_1 = round(-0.6931470894004217 * 2**30)
+_EXP2_2 = round(0.24022471105074825 * 2**30)
+_EXP2_3 = round(-0.055492297321333636 * 2**30)
+_EXP2_4 = round(0.00958221411253463 * 2**30)
+_EXP2_5 = round(-0.0012774730134135974 * 2**30)
+_EXP2_6 = round(0.00010993602092287385 * 2**30)
+
+
+@step
+def exp2_minus(x: Any) -> Any:
+    """2^-x, Q30, for x in Q24, 0 <= x < 2^62; error below 1e-8, 0 from x = 32 on."""
+    f = (x & 0xFFFFFF) << 6  # fraction of x, Q30
+    series = _EXP2_5 + ((_EXP2_6 * f) >> 30)
+    series = _EXP2_4 + ((series * f) >> 30)
+    series = _EXP2_3 + ((series * f) >> 30)
+    series = _EXP2_2 + ((series * f) >> 30)
+    series = _EXP2_1 + ((series * f) >> 30)
+    value = (int64(1) << 30) + ((series * f) >> 30)
+    # Halved as often as the whole part of x says, by shifts that do not depend on the data.
+    whole = x >> 24
+    if whole & 1:
+        value = value >> 1
+    if whole & 2:
+        value = value >> 2
+    if whole & 4:
+        value = value >> 4
+    if whole & 8:
+        value = value >> 8
+    if whole & 16:
+        value = value >> 16
+    return value if whole < 32 else int64(0)

@@ -30,6 +30,17 @@ class Vehicle:
     characteristic: Characteristic | None = None
 
 
+@dataclass(frozen=True)
+class Recall:
+    """What a law that recalls the last run sees of it; `controller/memory.py`. The reference is
+    previewed by the same look-ahead."""
+
+    ahead_ticks: int  # from now to the cell whose first words the law sees
+    smooth_word: int  # the word of which it sees a moving average
+    smooth_ticks: int  # ticks either side that the average takes in
+    late_word: int  # words from here on belong to the tick before the one that gives them
+
+
 def fixed(key: str, value: float, q: int, bits: int = 32) -> int:
     """`value` in units of 2**-q as a signed integer of `bits`; raises CalibrationError if it does
     not fit."""

@@ -18,6 +18,7 @@ DELAY_MAX = 16
 
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e3)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e3)]
+Efficiency = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -28,6 +29,7 @@ class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     lag_traction_s: NotNegative = 0.0
     lag_brake_s: NotNegative = 0.0
     jerk_max_m_s3: NotNegative = 0.0  # slope of the command
+    recuperation_efficiency: Efficiency = 0.0  # part of the braking work that comes back
 
     def __post_init__(self) -> None:
         if not 0 <= self.delay_ticks < DELAY_MAX:

@@ -80,7 +80,12 @@ class ProfilePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     max_jerk_m_s3: Positive
     ramps: tuple[Ramp, ...]
     limits: tuple[SpeedLimit, ...] = ()  # none: no limit over time
+    limit_above_m_s: Positive | None = None  # instead of `limits`: so much above the reference
     margin_m_s: NotNegative = 0.0  # to keep below `limits`
+
+    def __post_init__(self) -> None:
+        if self.limits and self.limit_above_m_s is not None:
+            raise PlanError("a plan takes only one of limits and limit_above_m_s")
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,9 @@ TRUTH = np.dtype(
         ("acceleration_m_s2", np.float64),  # mean over the period that ends here
         ("force_n", np.float64),  # of the actuators at the end of tick k
         ("permitted_speed_m_s", np.float64),
-        ("traction_j", np.float64),  # since the start of the run
+        ("traction_j", np.float64),  # work of traction since the start of the run
+        ("braking_j", np.float64),  # work taken up by braking, likewise
+        ("recuperated_j", np.float64),  # what of it came back
         ("coupler_force_n", np.float64),  # largest of any coupler over tick k; 0 for rigid trains
     ]
 )
@@ -80,6 +82,7 @@ NODE_PARAMS = np.dtype(
         ("speed_noise_m_s", np.float64),  # standard deviation
         ("rear_weight", np.float64),  # 0: sensor at the front, 0.5: mean of front and rear
         ("rear_offset_m", np.float64),  # distance of front and rear at rest
+        ("recuperation", np.float64),  # part of the braking work that comes back
         ("mass_kg", np.float64),
         ("holding_force_n", np.float64),  # of the actuators when a run begins
         ("weak_from", np.int64),  # first tick of lost traction
@@ -328,6 +331,8 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         truth.acceleration_m_s2 = train.acceleration_m_s2
         truth.permitted_speed_m_s = node.permitted_speed_m_s
         truth.traction_j = train.traction_j
+        truth.braking_j = train.braking_j
+        truth.recuperated_j = params.node.recuperation * train.braking_j
         read_commands(params.node, node, rx)
         radio.read(node, state.radio, rx)
         fail(params.node, node, train)

@@ -122,7 +122,7 @@ def drive(
     here.begin(here.params, here.state)
     rx_fresh = here.rx["fresh"]
     next_progress = time.monotonic()
-    for tick in range(here.ticks):
+    for tick in range(truth.shape[1]):
         here.sense(here.params, here.limits, here.state, chance, tick, here.tx)
         for train, bus in enumerate(buses):
             post(here, train, bus)
@@ -174,7 +174,8 @@ def one_run(
     stop: Stop,
 ) -> None:
     """Arms, drives and ends one run; its truth is written even if it is cut short."""
-    truth = np.zeros((len(buses), here.ticks), plant.TRUTH)
+    ticks = world.run_ticks(here.members[0], here.seed, run)
+    truth = np.zeros((len(buses), ticks), plant.TRUTH)
     file = out / f"truth_{run}.npy"
     for train, bus in enumerate(buses):
         agree(here, train, bus, plant.ARMED, run, arming_s, stop)
@@ -195,7 +196,7 @@ def one_run(
     tell(
         "run",
         run=run,
-        ticks=here.ticks,
+        ticks=ticks,
         seconds=seconds,
         file=str(file),
         faults=faults,

@@ -4,6 +4,9 @@ for what is wrong.
 A scenario may stand on another: `base = "subway-paper"` takes that one's values and replaces what
 this file states. Found by name among the packaged scenarios, or as the path of a file (a base's is
 relative to the file that names it).
+
+One file may hold named cases: `[cases.VI]` states what that case replaces, and `gradient:VI` (or
+`my.toml:VI`) is the scenario with it.
 """
 
 from __future__ import annotations
@@ -66,6 +69,21 @@ class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     hold_ticks: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 1  # a value stays for so many ticks
 
 
+class RunLength(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Runs of random length: each is cut after a uniform time, new in each run, while the train may
+    still be moving; one that would last beyond the profile ends with it."""
+
+    shortest_s: Positive
+    longest_s: Positive
+    first_s: Positive | None = None  # length of run 1, as a paper may give it
+
+    def __post_init__(self) -> None:
+        if self.longest_s < self.shortest_s:
+            raise ValueError(
+                f"longest_s is {self.longest_s:g}, expected shortest_s or more, {self.shortest_s:g}"
+            )
+
+
 class Metrics(
     msgspec.Struct,
     frozen=True,
@@ -107,6 +125,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     track: Track = Track()
     sensors: Sensors = Sensors()
     disturbance: Disturbance = Disturbance()
+    run_length: RunLength | None = None  # none: every run lasts as long as the profile
     control: Control = Control()
     metrics: Metrics = Metrics()
     line: Line | None = None  # several trains; none: one
@@ -118,8 +137,10 @@ class Loaded(msgspec.Struct, frozen=True):
     """A scenario with what follows from it: of the line's first train, or as `member` gives it, of
     another."""
 
-    name: str
+    name: str  # with its case, as `load` takes it
     path: Path
+    case: str  # "" for none
+    cases: tuple[str, ...]  # names of those that the scenario has
     digest: str  # of the merged content
     scenario: Scenario
     segments: np.ndarray  # profile.SEGMENT
@@ -127,8 +148,19 @@ class Loaded(msgspec.Struct, frozen=True):
     train: int = 0  # place on the line, 0 leads
 
     @property
+    def folder_name(self) -> str:
+        """The name as part of a folder's."""
+        return self.name.replace(":", "-")
+
+    @property
+    def source(self) -> str:
+        """What loads this scenario in another process."""
+        path = str(self.path.absolute())
+        return f"{path}:{self.case}" if self.case else path
+
+    @property
     def ticks(self) -> int:
-        """Control periods of a run."""
+        """Control periods of a whole run."""
         return len(self.profile.x)
 
     @property
@@ -147,20 +179,35 @@ def scenario_names() -> list[str]:
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
-def find(name: str) -> Path:
-    """File of a scenario, by name or path. Raises ScenarioError if there is none."""
-    if name.endswith(".toml"):
-        path = Path(name)
+def case_names() -> list[str]:
+    """Names of the packaged scenarios, each followed by those of its cases."""
+    return [
+        name
+        for scenario in scenario_names()
+        for name in (scenario, *(f"{scenario}:{case}" for case in load(scenario).cases))
+    ]
+
+
+def find(name: str) -> tuple[Path, str]:
+    """File of a scenario, by name or path, and its case, "" for none. Raises ScenarioError if there
+    is no such file."""
+    file, separator, case = name.rpartition(":")
+    if not separator or Path(name).is_file():
+        file, case = name, ""
+    elif not case:
+        raise ScenarioError(f"{name}: expected the name of a case after the colon")
+    if file.endswith(".toml"):
+        path = Path(file)
         if not path.is_file():
-            raise ScenarioError(f"{name}: no such scenario file")
-        return path
-    path = FOLDER / f"{name}.toml"
+            raise ScenarioError(f"{file}: no such scenario file")
+        return path, case
+    path = FOLDER / f"{file}.toml"
     if not path.is_file():
         raise ScenarioError(
-            f"scenario {name!r} is unknown, expected one of {', '.join(scenario_names())},"
+            f"scenario {file!r} is unknown, expected one of {', '.join(scenario_names())},"
             " or a .toml file"
         )
-    return path
+    return path, case
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -190,30 +237,73 @@ def _content(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
         raise ScenarioError(f"{path}: key `base`: expected the name of a scenario")
     if base:
         try:
-            below = find(str(path.parent / base) if base.endswith(".toml") else base)
+            below, case = find(str(path.parent / base) if _is_file_name(base) else base)
         except ScenarioError as error:
             raise ScenarioError(f"{path}: key `base`: {error}") from None
-        content = _merged(_content(below, (*seen, path)), content)
+        content = _merged(_in_case(below, case, _content(below, (*seen, path))), content)
     return content
 
 
-@lru_cache(maxsize=32)
+def _is_file_name(name: str) -> bool:
+    return name.endswith(".toml") or ".toml:" in name
+
+
+def _in_case(path: Path, case: str, content: dict[str, Any]) -> dict[str, Any]:
+    """`content` with what its case `case` replaces."""
+    cases = _cases(path, content)
+    if not case:
+        return content
+    if case not in cases:
+        known = f"expected one of {', '.join(cases)}" if cases else "the scenario has none"
+        raise ScenarioError(f"{path}: case {case!r} is unknown, {known}")
+    return _merged(content, cases[case])
+
+
+def _cases(path: Path, content: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    cases = content.get("cases", {})
+    if not isinstance(cases, dict) or not all(isinstance(c, dict) for c in cases.values()):
+        raise ScenarioError(f"{path}: key cases: expected tables, [cases.NAME]")
+    return cases
+
+
+@lru_cache(maxsize=64)
 def load(name: str) -> Loaded:
-    """A scenario by name or path, validated and planned. Raises ScenarioError with one line."""
-    path = find(name)
+    """A scenario by name or path, or a case of one, validated and planned.
+
+    Raises ScenarioError with one line.
+    """
+    return overlaid(name, {})
+
+
+def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
+    """The scenario that `load` gives with the tables of `overlay` on top, as a file would state
+    them."""
+    path, case = find(name)
     content = _content(path)
+    cases = tuple(_cases(path, content))
+    content = _merged(_in_case(path, case, content), overlay)
+    content.pop("cases", None)
     try:
         scenario = msgspec.convert(content, Scenario)
     except msgspec.ValidationError as error:
-        raise ScenarioError(f"{path}: {_where(str(error))}") from None
-    _check(path, scenario)
+        raise ScenarioError(f"{_place(path, case)}: {_where(str(error))}") from None
+    _check(_place(path, case), scenario)
     try:
         segments = plan_profile(scenario.profile, scenario.period_s)
         profile = evaluate(segments, scenario.period_s)
     except (PlanError, ValueError) as error:
-        raise ScenarioError(f"{path}: [profile]: {error}") from None
+        raise ScenarioError(f"{_place(path, case)}: [profile]: {error}") from None
     digest = hashlib.blake2b(msgspec.json.encode(content, order="deterministic"), digest_size=16)
-    loaded = Loaded(path.stem, path, digest.hexdigest(), scenario, segments, profile)
+    loaded = Loaded(
+        f"{path.stem}:{case}" if case else path.stem,
+        path,
+        case,
+        cases,
+        digest.hexdigest(),
+        scenario,
+        segments,
+        profile,
+    )
     if scenario.line:
         members(loaded)  # so that a wrong one is refused here
     return loaded
@@ -261,13 +351,18 @@ def _own_numbers(loaded: Loaded, line: Line, train: int) -> Scenario:
         raise ScenarioError(f"{where}: {_where(str(error))}") from None
 
 
+def _place(path: Path, case: str) -> str:
+    """Where a scenario's content is from, for messages."""
+    return f"{path}, case {case}" if case else str(path)
+
+
 def _where(message: str) -> str:
     """The validator's message with the key first: `train.masses_kg: Expected ...`."""
     text, _, place = message.partition(" - at `$.")
     return f"key {place.rstrip('`')}: {text}" if place else text
 
 
-def _check(path: Path, scenario: Scenario) -> None:
+def _check(path: str, scenario: Scenario) -> None:
     """What types cannot say."""
     if scenario.law not in scenario.laws:
         raise ScenarioError(
@@ -294,5 +389,5 @@ def _check(path: Path, scenario: Scenario) -> None:
         raise ScenarioError(f"{path}: key track.{key}: {model}")
     if scenario.line and not isinstance(scenario.train, point.Train):
         raise ScenarioError(f"{path}: key train.model: a line has trains of model 'point'")
-    if not scenario.profile.limits:
+    if not scenario.profile.limits and scenario.profile.limit_above_m_s is None:
         raise ScenarioError(f"{path}: key profile.limits: expected at least one limit")

@@ -20,8 +20,8 @@ from plant_sim.trains import point
 from plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 # Chance: what a random number is drawn for; each gets a stream of its own, in each train.
-SPEED_NOISE, DISTURBANCE, LOST_AHEAD, LOST_BEHIND = 0, 1, 2, 3
-STREAMS = 4  # of a train
+SPEED_NOISE, DISTURBANCE, RUN_LENGTH, LOST_AHEAD, LOST_BEHIND = 0, 1, 2, 3, 4
+STREAMS = 5  # of a train
 NEVER = 2**62  # tick
 
 
@@ -41,11 +41,6 @@ class World:
     rx: Any  # [trains, MESSAGE_COUNT] mailboxes
     tx: Any
 
-    @property
-    def ticks(self) -> int:
-        """Control periods of a run."""
-        return self.members[0].ticks
-
 
 def rows(array: np.ndarray) -> Any:
     """A structured array in the form that steps take."""
@@ -57,10 +52,6 @@ def build(loaded: Loaded, seed: int) -> World:
     scenario = loaded.scenario
     model = MODELS[type(scenario.train)]
     trains = members(loaded)
-    limits = np.zeros(len(scenario.profile.limits), plant.LIMIT)
-    for row, limit in zip(limits, scenario.profile.limits, strict=True):
-        row["until_tick"] = round(limit.until_s / scenario.period_s)
-        row["speed_m_s"] = limit.speed_m_s
     begin, sense, actuate_and_advance = plant.build(model)
     params = np.zeros(len(trains), plant.params_dtype(model.PARAMS))
     for train in trains:
@@ -74,7 +65,7 @@ def build(loaded: Loaded, seed: int) -> World:
         actuate_and_advance=actuate_and_advance,
         params=rows(params),
         state=rows(np.zeros(len(trains), plant.state_dtype(model.STATE))),
-        limits=rows(limits),
+        limits=rows(limits_of(loaded)),
         track=rows(track.sections(scenario.track)),
         rx=rows(np.zeros(boxes, MAILBOX)),
         tx=rows(np.zeros(boxes, MAILBOX)),
@@ -101,6 +92,7 @@ def _params(loaded: Loaded, model: Any) -> np.ndarray:
     node["speed_noise_m_s"] = scenario.sensors.speed_noise_m_s
     node["rear_weight"] = 0.5 if scenario.sensors.location == "mean" else 0.0
     node["rear_offset_m"] = train.rear_offset_m
+    node["recuperation"] = scenario.actuator.recuperation_efficiency
     if isinstance(train, point.Train) and train.held_at_start:
         sections = rows(track.sections(scenario.track))
         here = track.section_at(sections, train.start_m, 0)
@@ -130,6 +122,37 @@ def _fail(node: np.ndarray, fault: Fault, scenario: Scenario) -> None:
         node["brake_supervision"] = plant.EMERGENCY_BRAKE if fault.emergency else 0
 
 
+def limits_of(loaded: Loaded) -> np.ndarray:
+    """The permitted speed over time, [n] of plant.LIMIT: as the plan states it, or a row for each
+    speed of the reference."""
+    plan, period_s = loaded.scenario.profile, loaded.scenario.period_s
+    if plan.limit_above_m_s is not None:
+        speed_m_s = loaded.profile.speed_m_s
+        last = np.flatnonzero(np.diff(speed_m_s, append=np.inf))
+        limits = np.zeros(len(last), plant.LIMIT)
+        limits["until_tick"] = last
+        limits["speed_m_s"] = speed_m_s[last] + plan.limit_above_m_s
+        return limits
+    limits = np.zeros(len(plan.limits), plant.LIMIT)
+    for row, limit in zip(limits, plan.limits, strict=True):
+        row["until_tick"] = round(limit.until_s / period_s)
+        row["speed_m_s"] = limit.speed_m_s
+    return limits
+
+
+def run_ticks(loaded: Loaded, seed: int, run: int) -> int:
+    """Control periods of a run: all, or as far as its random length goes."""
+    lengths = loaded.scenario.run_length
+    if lengths is None:
+        return loaded.ticks
+    length_s = lengths.shortest_s + (lengths.longest_s - lengths.shortest_s) * float(
+        _uniform(_bits(seed, run, RUN_LENGTH, 1))[0]
+    )
+    if run == 1 and lengths.first_s is not None:
+        length_s = lengths.first_s
+    return min(int(length_s / loaded.scenario.period_s + 0.5) + 1, loaded.ticks)
+
+
 def _bits(seed: int, run: int, stream: int, count: int) -> np.ndarray:
     """`count` random 64-bit words, a function of seed, run and stream alone."""
     generator = np.random.Philox(key=[seed, (run << 8) + stream])
@@ -147,9 +170,12 @@ def chances(here: World, run: int) -> Any:
 
 
 def chance(loaded: Loaded, seed: int, run: int) -> np.ndarray:
-    """Random numbers of a train in a run, [ticks] of plant.CHANCE; only what the scenario uses is
-    drawn."""
-    ticks = loaded.ticks
+    """Random numbers of a train in a run, [run_ticks] of plant.CHANCE; only what the scenario uses
+    is drawn.
+
+    A tick's number does not depend on when the run ends.
+    """
+    ticks = run_ticks(loaded, seed, run)
     first = STREAMS * loaded.train
     drawn = np.zeros(ticks, plant.CHANCE)
     if loaded.scenario.sensors.speed_noise_m_s > 0:

@@ -61,10 +61,11 @@ def test_the_console_script_resolves():
     assert callable(script.load())
 
 
-def test_python_can_finds_the_hub():
-    (interface,) = entry_points(group="can.interface", name="atohub")
+@pytest.mark.parametrize("name", ["atohub", "atovcan"])
+def test_python_can_finds_our_buses(name):
+    (interface,) = entry_points(group="can.interface", name=name)
     assert issubclass(interface.load(), can.BusABC)
-    assert "atohub" in can.VALID_INTERFACES
+    assert name in can.VALID_INTERFACES
 
 
 def test_only_the_compiler_is_pinned_exactly():

@@ -21,6 +21,7 @@ from tools import session, setup, sil
 
 SCENARIO = "subway-fast"
 HIL_SCENARIO = "subway"
+LEARNING_SCENARIO = "crh3-learning"
 TICKS_OF_PEER = 4000
 # What HIL moves in a tick of `subway`: frames to the controller, frames back.
 FRAMES_THERE, FRAMES_BACK = 3, 4
@@ -52,8 +53,10 @@ class _Silent:
 
 def measure(bus: str) -> list[Figure]:
     """SIL and HIL rates with their peers."""
+    peer = control_rate()
     return [
-        Figure("SIL, whole chain, traces off", sil_rate(), "python-control", control_rate()),
+        Figure("SIL, whole chain, traces off", sil_rate(), "python-control", peer),
+        Figure("SIL, 250 000 ticks a run, whole session", session_rate(), "python-control", peer),
         Figure(
             "HIL, three processes, trace on", hil_rate(bus), "bare python-can echo", echo_rate(bus)
         ),
@@ -69,6 +72,25 @@ def sil_rate() -> float:
         for result, _node in sil.run(loaded, calibration, runs=range(1, 6), seed=1)
     ]
     return float(np.median(rates))
+
+
+def session_rate() -> float:
+    """Rate of runs 2 to 5 of the fuzzy learning law on the noisy 52 km, ticks/s: chance, loop,
+    digest and metrics counted."""
+    marks: list[float] = []
+
+    class Clock(_Silent):
+        def row(self, row: dict[str, Any]) -> None:
+            marks.append(time.perf_counter())
+            ticks.append(row["ticks"])
+
+    ticks: list[int] = []
+    with tempfile.TemporaryDirectory(prefix="ato-hil-") as folder:
+        options = session.Options(
+            LEARNING_SCENARIO, None, 5, "sil", "none", 1, Path(folder), None, trace=False
+        )
+        session.run(options, Clock())
+    return sum(ticks[1:]) / (marks[-1] - marks[0])
 
 
 def control_rate() -> float:

@@ -88,6 +88,18 @@ LINE_COLUMNS = (
 # The columns that do not tell how fast the bench was, and the comfort.
 COMPARED = (*COLUMNS[:-1], ("rms jerk\nm/s³", "rms_command_jerk_m_s3", 1, "{:.3f}"))
 
+# Errors from millimetres to kilometres, and where the energy went.
+SWEPT = (
+    ("run", "run", 1, "{:d}"),
+    ("rms speed\nm/s", "rms_speed_error_m_s", 1, "{:.4g}"),
+    ("rms position\nm", "rms_position_error_m", 1, "{:.4g}"),
+    ("stop error\nm", "stop_error_m", 1, "{:.4g}"),
+    ("traction\nkWh/t", "energy_kwh_per_t", 1, "{:.4f}"),
+    ("braking\nkWh/t", "braking_kwh_per_t", 1, "{:.4f}"),
+    ("net\nkWh/t", "net_energy_kwh_per_t", 1, "{:.4f}"),
+    ("rms jerk\nm/s³", "rms_command_jerk_m_s3", 1, "{:.3f}"),
+)
+
 
 class Screen:
     """Progress bar and table of a session; a plain line a run where there is no terminal."""
@@ -280,7 +292,7 @@ def _run(
         name = session.EXTERNAL_LAW
     else:
         name = law_label(law or loaded.scenario.law)
-    folder = out or Path("runs") / f"{loaded.name}-{name}-{mode.value}"
+    folder = out or Path("runs") / f"{loaded.folder_name}-{name}-{mode.value}"
     options = session.Options(
         scenario, law, runs, mode.value, bus, seed, folder, memory, trace, record, external
     )
@@ -327,11 +339,13 @@ def replay(
 ) -> None:
     """Feed a recording to the controller alone; say where its commands first differ (exit 1)."""
     with one_line_for_bad_input():
+        from controller.registry import law_label
         from tools import replay as open_loop
 
         prepared = open_loop.prepare(recording, scenario, law, memory, channel)
         console.print(
-            f"{prepared.loaded.name}, {prepared.calibration.law}: {len(prepared.runs)} runs",
+            f"{prepared.loaded.name}, {law_label(prepared.calibration.law)}:"
+            f" {len(prepared.runs)} runs",
             soft_wrap=True,
         )
         for note in prepared.notes:
@@ -372,11 +386,11 @@ def decode(
 @app.command("list")
 def list_scenarios() -> None:
     """List the scenarios and the laws that each has gains for."""
-    from plant_sim.scenario import ScenarioError, load, scenario_names
+    from plant_sim.scenario import ScenarioError, case_names, load
 
     table = Table("scenario", "laws (default first)", "run", "what it is", header_style="bold")
     try:
-        for name in scenario_names():
+        for name in case_names():
             loaded = load(name)
             default = loaded.scenario.law
             others = sorted(set(loaded.scenario.laws) - {default})
@@ -453,7 +467,7 @@ def compare(
         from tools import session
 
         loaded = load(scenario)
-        folder = out or Path("runs") / f"{loaded.name}-compare"
+        folder = out or Path("runs") / f"{loaded.folder_name}-compare"
         session.prepare(folder)
         names = [law.strip() for law in laws.split(",") if law.strip()]
         with console.status("") as status:
@@ -481,8 +495,80 @@ def compare(
 
 
 @app.command()
+def sweep(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario or a .toml file.")],
+    vary: Annotated[
+        list[str],
+        typer.Option(
+            help="KEY=VALUE,VALUE...: a key of the scenario (sensors.speed_noise_m_s), of the law"
+            " (law.S) or `case`; given several times, all combinations."
+        ),
+    ],
+    law: Annotated[str | None, typer.Option(help="Control law; the scenario's by default.")] = None,
+    runs: Annotated[
+        int | None, typer.Option(min=1, help="Runs in a row; the scenario's by default.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of noise and disturbance.")] = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of sweep.csv, sweep.json, pareto.png and pareto.svg;"
+            " runs/SCENARIO-sweep by default."
+        ),
+    ] = None,
+) -> None:
+    """Vary numbers of a scenario, side by side on all cores (SIL): a table, and energy against
+    error."""
+    try:
+        with one_line_for_bad_input():
+            _sweep(scenario, vary, law, runs, seed, out)
+    except KeyboardInterrupt:
+        raise _fail("interrupted; nothing was written", EXIT_INTERRUPTED) from None
+
+
+def _sweep(
+    scenario: str, vary: list[str], law: str | None, runs: int | None, seed: int, out: Path | None
+) -> None:
+    from plant_sim.scenario import load
+    from tools import session
+    from tools import sweep as side_by_side
+
+    points = side_by_side.plan(scenario, law, vary, runs, seed)
+    loaded = load(scenario)
+    folder = out or Path("runs") / f"{loaded.folder_name}-sweep"
+    session.prepare(folder)
+    keys = list(points[0].values)
+    done: dict[int, dict[str, Any]] = {}
+    with console.status(f"{len(points)} combinations: compiling") as status:
+        for index, row in side_by_side.sweep(points):
+            done[index] = row
+            status.update(f"{len(done)} of {len(points)} combinations")
+    rows = [done[index] for index in range(len(points))]
+    side_by_side.write_table(folder / "sweep.csv", rows)
+    session.write_json(
+        folder / "sweep.json",
+        {"schema": 1, "scenario": loaded.name, "law": points[0].law, "vary": keys, "rows": rows},
+    )
+    for suffix in ("png", "svg"):
+        side_by_side.plot(folder / f"pareto.{suffix}", loaded, rows, keys)
+    front = set(side_by_side.pareto(rows))
+    table = Table(*keys, *(name for name, *_rest in SWEPT), "front", "faults", header_style="bold")
+    for index, row in enumerate(rows):
+        table.add_row(
+            *(str(row[key]) for key in keys),
+            *(_cell(row, key, f, s) for _n, key, f, s in SWEPT),
+            "*" if index in front else "",
+            row["faults"],
+        )
+    console.print(table)
+    console.print("* no other combination has less energy and less position error")
+    console.print(f"table   {folder / 'sweep.csv'}, sweep.json", soft_wrap=True)
+    console.print(f"plot    {folder / 'pareto.png'}, pareto.svg", soft_wrap=True)
+
+
+@app.command()
 def claims(
-    paper: Annotated[str, typer.Argument(help="The paper, by its law: cailc, drac.")],
+    paper: Annotated[str, typer.Argument(help="The paper, by its law: cailc, drac, iplc.")],
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the rows to this file as well.")
     ] = None,
@@ -581,21 +667,48 @@ def _print_bus_report(found: BusReport) -> None:
 
 @app.command()
 def bench(
-    bus: Annotated[str, typer.Option(help="Bus of the HIL figure.")] = "hub:bench",
+    bus: Annotated[
+        list[str] | None,
+        typer.Option(help="Bus to measure, may be repeated; the first is that of the HIL figure."),
+    ] = None,
+    sessions: Annotated[bool, typer.Option(help="Measure SIL and HIL too.")] = True,
 ) -> None:
-    """Measure the rates of SIL and HIL as ratios to a peer in the same run."""
+    """Measure SIL, HIL and buses as ratios to a peer in the same run."""
     from tools import bench as rates
+    from tools import pingpong
 
-    table = Table("what", "ticks/s", "peer", "peer's ticks/s", "ratio", header_style="bold")
-    for figure in rates.measure(bus):
-        table.add_row(
-            figure.what,
-            f"{figure.ticks_per_s:,.0f}",
-            figure.peer,
-            f"{figure.peer_ticks_per_s:,.0f}",
-            f"{figure.ratio:.2f}",
+    buses = bus or ["hub:bench"]
+    with one_line_for_bad_input():
+        if sessions:
+            table = Table("what", "ticks/s", "peer", "peer's ticks/s", "ratio", header_style="bold")
+            for figure in rates.measure(buses[0]):
+                table.add_row(
+                    figure.what,
+                    f"{figure.ticks_per_s:,.0f}",
+                    figure.peer,
+                    f"{figure.peer_ticks_per_s:,.0f}",
+                    f"{figure.ratio:.2f}",
+                )
+            console.print(table)
+        table = Table(
+            *("ping-pong", "round trip p50 µs", "p99 µs", "frames/s"),
+            *("p50 : C", "p99 : C", "frames/s : C"),
+            header_style="bold",
         )
-    console.print(table)
+        for name in buses:
+            figures = pingpong.measure(name)
+            for pair in figures:
+                table.add_row(*_ping_pong(pair, figures[0]))
+        console.print(table)
+
+
+def _ping_pong(figure: Any, peer: Any) -> list[str]:
+    cells = (figure.median_us, figure.slowest_us, figure.frames_per_s)
+    row = [figure.what, *(f"{cell:,.0f}" for cell in cells)]
+    if peer.what.startswith("C"):
+        peers = (peer.median_us, peer.slowest_us, peer.frames_per_s)
+        row += [f"{mine / its:.2f}" for mine, its in zip(cells, peers, strict=True)]
+    return row
 
 
 def _print_rows(rows: list[Row]) -> None:

@@ -104,11 +104,12 @@ def _hub() -> Finding:
 
 
 def _vcan0() -> Finding:
-    from can_dbc.bus import socketcan_reason
+    from can_dbc.bus import small_buffer_reason, socketcan_reason
 
     reason = socketcan_reason("vcan0")
     if not reason:
-        return Finding("bus socketcan:vcan0", "works", "the interface exists; `auto` takes it")
+        text = "; ".join(filter(None, ("`auto` takes it", small_buffer_reason())))
+        return Finding("bus socketcan:vcan0", "works", f"the interface exists; {text}")
     return Finding(
         "bus socketcan:vcan0",
         "absent",
@@ -118,12 +119,12 @@ def _vcan0() -> Finding:
 
 
 def _private_vcan() -> Finding:
-    from can_dbc.bus import private_vcan_reason
+    from can_dbc.bus import private_vcan_reason, small_buffer_reason
 
-    reason = private_vcan_reason()
-    return Finding(
-        "bus vcan", "absent" if reason else "works", reason or "a private vcan can be made"
-    )
+    if reason := private_vcan_reason():
+        return Finding("bus vcan", "absent", reason)
+    text = "; ".join(filter(None, ("a private vcan was made", small_buffer_reason())))
+    return Finding("bus vcan", "works", text)
 
 
 def _viewer() -> Finding:

@@ -117,7 +117,8 @@ def decode(frames: np.ndarray, message: Any, signal: str) -> tuple[np.ndarray, n
 def held(frames: np.ndarray, ticks: int, message: Any, signal: str) -> np.ndarray:
     """Physical values (float64) of one signal in ticks 0 to `ticks` - 1; a tick without the frame
     repeats the last, and is 0 before the first."""
-    at, values = decode(frames[frames["tick"] < ticks], message, signal)
+    at, values = decode(frames, message, signal)
+    at, values = at[at < ticks], values[at < ticks]
     row = np.zeros(ticks, np.int64)
     row[at] = np.arange(1, len(at) + 1)
     return np.concatenate(([0.0], values))[np.maximum.accumulate(row)]

@@ -29,7 +29,7 @@ READY_TIMEOUT_S = 300.0  # the first start compiles
 # The plant's own limit while the observer judges a foreign controller, and names what is wrong.
 EXTERNAL_TIMEOUT_S = 3.0
 STOP_TIMEOUT_S = 0.7  # of a node that was asked to end
-RECORDER_TIMEOUT_S = 20.0  # from the end of the last run to the recorder's account of it
+RECORDER_TIMEOUT_S = 60.0  # from the end of the last run to the recorder's account of it
 
 
 class RunError(Exception):

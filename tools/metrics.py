@@ -32,6 +32,11 @@ def run_metrics(
     window = slice(first, int(last))
     e, ed = position_error[window], speed_error[window]
     mass = scenario.train.mass_kg
+    tonnes = mass / 1000.0
+    work = {
+        name: float(truth[f"{name}_j"][-1]) / 3.6e6 / tonnes
+        for name in ("traction", "braking", "recuperated")
+    }
     jerk = np.diff(command_n) / (mass * scenario.period_s)
     return {
         "ticks": ticks,
@@ -45,7 +50,10 @@ def run_metrics(
         "max_acceleration_m_s2": _peak(truth["acceleration_m_s2"]),
         "rms_command_jerk_m_s3": _rms(jerk),
         "overspeed_margin_m_s": float(np.min(truth["permitted_speed_m_s"] - truth["speed_m_s"])),
-        "energy_kwh_per_t": float(truth["traction_j"][-1]) / 3.6e6 / (mass / 1000.0),
+        "energy_kwh_per_t": work["traction"],
+        "braking_kwh_per_t": work["braking"],
+        "recuperated_kwh_per_t": work["recuperated"],
+        "net_energy_kwh_per_t": work["traction"] - work["recuperated"],
     }
 
 

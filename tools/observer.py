@@ -247,8 +247,9 @@ def measured_truth(frames: np.ndarray, ticks: int, period_s: float) -> np.ndarra
     truth["acceleration_m_s2"] = held(frames, ticks, TRAIN_SPEED, "Acceleration")
     truth["permitted_speed_m_s"] = held(frames, ticks, ATP_LIMIT, "PermittedSpeed")
     truth["force_n"] = held(frames, ticks, FORCE_CMD, "Force")
-    power_w = np.maximum(truth["force_n"] * truth["speed_m_s"], 0.0)
-    truth["traction_j"] = np.cumsum(power_w) * period_s
+    power_w = truth["force_n"] * truth["speed_m_s"]
+    truth["traction_j"] = np.cumsum(np.maximum(power_w, 0.0)) * period_s
+    truth["braking_j"] = np.cumsum(np.maximum(-power_w, 0.0)) * period_s
     return truth
 
 

@@ -31,8 +31,9 @@ import msgspec
 import numpy as np
 from can.io.mf4 import MF4Writer
 
-from can_dbc.codec import INDEX_OF_FRAME_ID
-from tools.frames import FRAME, RUNNING, run_controls, ticks_of
+from can_dbc import e2e
+from can_dbc.codec import INDEX_OF_FRAME_ID, TRAIN_POSITION, get
+from tools.frames import FRAME, RUNNING, columns, run_controls, ticks_of
 
 FORMATS = {
     ".asc": "a Vector ASC log",
@@ -55,9 +56,9 @@ class Origin(msgspec.Struct, frozen=True, kw_only=True):
     """The session that a recording comes from, as FILE.json has it."""
 
     schema: int
-    scenario: str  # name of a packaged scenario, or absolute path
+    scenario: str  # name of a packaged scenario, or absolute path; with its case
     scenario_digest: str
-    law: str
+    law: str  # name, or absolute path
     mode: str
     seed: int
     memory: str | None  # file in the folder of the recording: the memory before the first run
@@ -112,19 +113,19 @@ def beside(path: Path, ending: str) -> Path:
 def save_origin(
     path: Path,
     *,
-    scenario: Path,
-    packaged: bool,
+    scenario: str,
     scenario_digest: str,
     law: str,
     mode: str,
     seed: int,
     memory_file: Path | None,
 ) -> None:
-    """Write FILE.json, and FILE.memory if `memory_file` exists. Raises RecordError."""
+    """Write FILE.json, and FILE.memory if `memory_file` exists; `scenario` as in Origin. Raises
+    RecordError."""
     copy = beside(path, "memory")
     origin = Origin(
         schema=SCHEMA,
-        scenario=scenario.stem if packaged else str(scenario.absolute()),
+        scenario=scenario,
         scenario_digest=scenario_digest,
         law=law,
         mode=mode,
@@ -385,8 +386,17 @@ def runs_of(recorded: Recorded) -> list[RecordedRun]:
         frames["frame_id"] = recorded.frame_ids[start:end]
         frames["payload"] = recorded.words[start:end]
         frames["tick"] = ticks_of(frames["frame_id"])
+        frames["tick"] += _first_tick(frames)
         runs.append(RecordedRun(number, start, frames))
     return runs
+
+
+def _first_tick(frames: np.ndarray) -> int:
+    """Tick of the run at which its recording begins, as TRAIN_POSITION says."""
+    for tick, word in zip(*columns(frames, TRAIN_POSITION), strict=True):
+        if e2e.check(int(word), -1, TRAIN_POSITION.data_id) == e2e.OK:
+            return int(get(int(word), TRAIN_POSITION.Tick)) - int(tick)
+    return 0
 
 
 def load_origin(path: Path) -> Origin | None:

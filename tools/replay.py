@@ -109,10 +109,9 @@ def prepare(
 
 def _refuse_late_start(path: Path, run: RecordedRun) -> None:
     """Raise RecordError if the recording begins inside the run."""
-    positions = run.frames["payload"][run.frames["frame_id"] == TRAIN_POSITION.frame_id]
-    if not len(positions):
+    if not (run.frames["frame_id"] == TRAIN_POSITION.frame_id).any():
         raise RecordError(f"{path}: run {run.number} has no TRAIN_POSITION")
-    tick = int(get(int(positions[0]), TRAIN_POSITION.Tick))
+    tick = int(run.frames["tick"][0])
     if tick:
         raise RecordError(
             f"{path}: run {run.number} begins at tick {tick}, expected it from tick 0"

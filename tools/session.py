@@ -22,7 +22,7 @@ from can_dbc.bus import choose_bus, open_bus, recv_frames
 from controller import node
 from controller.calibration import Calibration
 from controller.interface import fault_names
-from controller.registry import load_law
+from controller.registry import is_file, load_law
 from plant_sim.scenario import FOLDER, Loaded, load, members
 from tools import hil, line, record, setup, sil
 from tools.frames import LineDigest
@@ -191,10 +191,9 @@ def _recording(session: Session) -> Iterator[None]:
         return
     record.save_origin(
         options.record,
-        scenario=loaded.path,
-        packaged=loaded.path.parent == FOLDER,
+        scenario=loaded.name if loaded.path.parent == FOLDER else loaded.source,
         scenario_digest=loaded.digest,
-        law=session.law,
+        law=str(Path(session.law).absolute()) if is_file(session.law) else session.law,
         mode=options.mode,
         seed=options.seed,
         memory_file=options.memory,
@@ -360,7 +359,7 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, _recording(session):
         kept = Path(scratch)
         events = hil.run(
-            scenario=str(loaded.path),
+            scenario=loaded.source,
             controllers=calibrations,
             buses=buses,
             runs=session.runs,

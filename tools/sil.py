@@ -145,10 +145,9 @@ def run_line(
     params, state, cells = _put_side_by_side(nodes, here)
     loop = build_loop(nodes[0].tick, here.sense, here.actuate_and_advance)
     trains = len(nodes)
-    frames = world.rows(np.zeros((trains, loaded.ticks * MESSAGE_COUNT), FRAME))
     counts = np.zeros(trains, np.int64)
 
-    def drive(ticks: int, chance: Any, truth: Any) -> None:
+    def drive(ticks: int, chance: Any, truth: Any, frames: Any) -> None:
         loop(
             ticks,
             here.params,
@@ -168,32 +167,27 @@ def run_line(
         )
 
     # Compiles, or loads what was compiled before.
-    nothing = (trains, 0)
-    drive(
-        0, world.rows(np.zeros(nothing, plant.CHANCE)), world.rows(np.zeros(nothing, plant.TRUTH))
-    )
+    kinds = (plant.CHANCE, plant.TRUTH, FRAME)
+    drive(0, *(world.rows(np.zeros((trains, 1), kind)) for kind in kinds))
     for number in runs:
         if progress:
             progress(number, 0)
         _announce(here, nodes, plant.ARMED, number)
         here.begin(here.params, here.state)
         chance = world.chances(here, number)
-        truth = np.zeros((trains, loaded.ticks), plant.TRUTH)
+        ticks = chance.shape[1]
+        truth = np.zeros((trains, ticks), plant.TRUTH)
+        # As many rows as there could be; the system gives memory to those that are written.
+        frames = np.empty((trains, ticks * MESSAGE_COUNT), FRAME)
         started = time.perf_counter()
-        drive(loaded.ticks, chance, world.rows(truth))
+        drive(ticks, chance, world.rows(truth), world.rows(frames))
         seconds = time.perf_counter() - started
         faults = [fault_names(int(node.state[0]["core"]["faults"])) for node in nodes]
         _announce(here, nodes, plant.ENDED, number)
         if progress:
-            progress(number, loaded.ticks)
+            progress(number, ticks)
         yield [
-            RunResult(
-                number,
-                np.asarray(frames[train][: counts[train]]).view(FRAME).copy(),
-                truth[train],
-                faults[train],
-                seconds,
-            )
+            RunResult(number, frames[train, : counts[train]], truth[train], faults[train], seconds)
             for train in range(trains)
         ]
 

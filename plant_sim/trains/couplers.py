@@ -78,6 +78,7 @@ STATE = np.dtype(
         ("rear_speed_m_s", np.float64),
         ("force_n", np.float64),  # of all actuators at the end of the last period
         ("traction_j", np.float64),  # work of the positive forces since the start of the run
+        ("braking_j", np.float64),  # work taken up by the negative forces, 0 or more
         ("coupler_force_n", np.float64),  # largest tension or compression over the last period
         ("car_position_m", np.float64, (CARS_MAX,)),
         ("car_speed_m_s", np.float64, (CARS_MAX,)),
@@ -120,6 +121,7 @@ def reset(params: Any, state: Any) -> None:
     state.acceleration_m_s2 = 0.0
     state.force_n = 0.0
     state.traction_j = 0.0
+    state.braking_j = 0.0
     state.coupler_force_n = 0.0
     show_ends(params, state)
     lumped.start_phases(state.phase, 2)
@@ -153,6 +155,7 @@ def move(
     last = int64(params.cars) - 1
     largest = state.coupler_force_n
     work = 0.0
+    braking = 0.0
     ahead = 0.0
     for k in range(last + 1):
         x = position[k]
@@ -178,9 +181,11 @@ def move(
         speed[k] = v
         position[k] = x + h * v
         work += max(force, 0.0) * v
+        braking -= min(force, 0.0) * v
         ahead = behind
     state.coupler_force_n = largest
     state.traction_j += h * work
+    state.braking_j += h * braking
 
 
 @step

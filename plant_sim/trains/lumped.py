@@ -134,6 +134,7 @@ STATE = np.dtype(
         ("rear_speed_m_s", np.float64),
         ("force_n", np.float64),  # what the actuators gave at the end of the last period
         ("traction_j", np.float64),  # work of the positive force since the start of the run
+        ("braking_j", np.float64),  # work taken up by the negative force, 0 or more
         ("phase", OSCILLATOR, (3,)),
         ("section", np.int64, (CARS_MAX,)),
         ("track_m_s2", np.float64),  # W(x) / M while the front is in [level_from_m, level_until_m)
@@ -234,6 +235,7 @@ def reset(params: Any, state: Any) -> None:
     state.rear_speed_m_s = 0.0
     state.force_n = 0.0
     state.traction_j = 0.0
+    state.braking_j = 0.0
     start_phases(state.phase, 3)
     for k in range(CARS_MAX):
         state.section[k] = 0
@@ -294,6 +296,7 @@ def advance(
     h = params.step_s
     inverse_mass = 1.0 / params.mass_kg
     work = 0.0
+    braking = 0.0
     for _ in range(params.substeps):
         force = actuate(actuator_params, actuator, int64(0))
         outside = force * inverse_mass - constant
@@ -308,6 +311,7 @@ def advance(
         x += h * v_middle
         v = max(v + h * slope, 0.0)
         work += max(force, 0.0) * v_middle
+        braking -= min(force, 0.0) * v_middle
     state.acceleration_m_s2 = (v - state.speed_m_s) / params.period_s
     state.position_m = x
     state.speed_m_s = v
@@ -315,6 +319,7 @@ def advance(
     state.rear_speed_m_s = v
     state.force_n = actuator.actual[0]
     state.traction_j += work * h
+    state.braking_j += braking * h
     turn_phases(state.phase, params.rotation, 3)
 
 

@@ -107,6 +107,7 @@ STATE = np.dtype(
         ("rear_speed_m_s", np.float64),
         ("force_n", np.float64),  # what the actuators gave at the end of the last period
         ("traction_j", np.float64),  # work of the positive force since the start of the run
+        ("braking_j", np.float64),  # work taken up by the negative force, 0 or more
         ("phase", OSCILLATOR),  # in the middle of the next period
         ("section", np.int64),
     ],
@@ -148,6 +149,7 @@ def reset(params: Any, state: Any) -> None:
     state.rear_speed_m_s = 0.0
     state.force_n = 0.0
     state.traction_j = 0.0
+    state.braking_j = 0.0
     state.phase.sine = params.half_rotation.sine
     state.phase.cosine = params.half_rotation.cosine
     state.section = 0
@@ -183,6 +185,7 @@ def advance(
     h = params.step_s
     half = 0.5 * h
     work = 0.0
+    braking = 0.0
     section = int64(state.section)
     for _ in range(params.substeps):
         force = actuate(actuator_params, actuator, int64(0))
@@ -195,6 +198,7 @@ def advance(
         v = max(v + h * (outside - v_middle * (linear + square * v_middle)), 0.0)
         x += h * v_middle
         work += max(force, 0.0) * v_middle
+        braking -= min(force, 0.0) * v_middle
     state.position_m = x
     state.speed_m_s = v
     state.acceleration_m_s2 = (v - v_before) / params.period_s
@@ -202,6 +206,7 @@ def advance(
     state.rear_speed_m_s = v
     state.force_n = actuator.actual[0]
     state.traction_j += h * work
+    state.braking_j += h * braking
     state.section = section
     state.phase.sine = sine * params.rotation.cosine + cosine * params.rotation.sine
     state.phase.cosine = cosine * params.rotation.cosine - sine * params.rotation.sine

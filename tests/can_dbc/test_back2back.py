@@ -1,19 +1,13 @@
-"""python-can's own back-to-back tests on the embedded bus.
+"""python-can's own back-to-back tests on the embedded bus, fetched for the test."""
 
-They come from the source distribution of the installed version, fetched for the test: the wheel
-has none.
-"""
-
-import re
 import subprocess
 import sys
-import tarfile
 from pathlib import Path
 from xml.etree import ElementTree
 
-import can
 import pytest
 
+FETCH = Path(__file__).parents[1] / "python_can_tests.py"
 SUBCLASSES = """
 from test import back2back_test
 
@@ -36,17 +30,8 @@ class TestThreadSafeHub(HubOnOneChannel, back2back_test.TestThreadSafeBus):
 def source_distribution(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The unpacked sources of python-can, its tests only."""
     folder = tmp_path_factory.mktemp("python_can")
-    name = f"python-can=={can.__version__}"
-    command = [sys.executable, "-m", "pip", "download", "--no-deps", "--no-binary", "python-can"]
-    subprocess.run([*command, name], cwd=folder, check=True, timeout=300)
-    (archive,) = folder.glob("*.tar.gz")
-    with tarfile.open(archive) as sources:
-        # The package itself stays packed: the installed one is to be tested.
-        tests = [each for each in sources.getnames() if re.fullmatch(r"[^/]+/test/\w+\.py", each)]
-        for name in tests:
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(sources.extractfile(name).read())  # type: ignore[union-attr]
-    return folder / archive.name.removesuffix(".tar.gz")
+    subprocess.run([sys.executable, FETCH, folder], check=True, timeout=300)
+    return folder
 
 
 @pytest.mark.long

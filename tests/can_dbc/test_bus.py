@@ -3,14 +3,13 @@
 import errno
 import os
 import socket
-from types import SimpleNamespace
 
 import can
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc import bus as bus_module
+from can_dbc import private_vcan_server
 from can_dbc.bus import (
     FOREIGN,
     BusChoice,
@@ -58,6 +57,7 @@ def can_kernel_without_vcan0(monkeypatch):
     monkeypatch.setattr(socket, "AF_CAN", 29, raising=False)  # not there on every system
     monkeypatch.setattr(socket, "CAN_RAW", 1, raising=False)
     monkeypatch.setattr(socket, "socket", CanSocket)
+    monkeypatch.setattr("can_dbc.bus.receive_buffer_bytes", lambda: 64 << 20)
 
 
 @pytest.fixture
@@ -65,6 +65,18 @@ def can_kernel(can_kernel_without_vcan0, monkeypatch):
     """A kernel with an interface vcan0 and an interface can7 that is down."""
     monkeypatch.setattr(CanSocket, "up", ("vcan0",))
     monkeypatch.setattr(CanSocket, "down", ("can7",))
+
+
+@pytest.fixture
+def trial(monkeypatch, tmp_path):
+    """What trying to make a private vcan says, in place of the trial."""
+
+    def becomes(reason: str) -> None:
+        script = tmp_path / "trial.py"
+        script.write_text(f"raise SystemExit({reason!r} or 0)")
+        monkeypatch.setattr(private_vcan_server, "__file__", str(script))
+
+    return becomes
 
 
 @pytest.fixture
@@ -95,6 +107,14 @@ def test_names(name, interface, channel, resolved):
     assert choose_bus(resolved) == choice
 
 
+@pytest.mark.parametrize("name", ["vcan", "vcan:train2", "atovcan:train2"])
+def test_names_of_private_vcans(can_kernel, name):
+    choice = choose_bus(name)
+    channel = "vcan0" if name == "vcan" else "train2"
+    assert choice == BusChoice("atovcan", channel, "asked for")
+    assert choice.name == f"vcan:{channel}"
+
+
 def test_auto_takes_vcan0(can_kernel):
     choice = choose_bus("auto")
     assert choice.name == "socketcan:vcan0"
@@ -102,11 +122,45 @@ def test_auto_takes_vcan0(can_kernel):
     assert choose_bus(choice.name).name == choice.name
 
 
-def test_auto_takes_the_hub_without_vcan0(can_kernel_without_vcan0):
+def test_auto_takes_a_private_vcan_without_vcan0(can_kernel_without_vcan0, trial):
+    trial("")
+    choice = choose_bus("auto")
+    assert choice.name == "vcan:vcan0"
+    assert "there is no network interface 'vcan0' for CAN" in choice.reason
+
+
+SMALL = (
+    "the kernel keeps only 554 frames for a node that lags,"
+    " try: sudo sysctl net.core.rmem_max=8388608"
+)
+
+
+@pytest.fixture
+def small_buffers(monkeypatch):
+    """A kernel that gives this user no more than it did for decades."""
+    monkeypatch.setattr("can_dbc.bus.receive_buffer_bytes", lambda: 425_984)
+
+
+def test_auto_takes_the_hub_where_a_private_vcan_would_lose_frames(
+    can_kernel_without_vcan0, trial, small_buffers
+):
+    trial("")
     choice = choose_bus("auto")
     assert choice.name == "hub:vcan0"
-    assert "there is no network interface 'vcan0' for CAN" in choice.reason
-    assert private_vcan_reason() in choice.reason
+    assert choice.reason == f"there is no network interface 'vcan0' for CAN; {SMALL}"
+
+
+def test_small_buffers_are_said(can_kernel, small_buffers):
+    assert choose_bus("auto").reason == f"vcan0 exists; {SMALL}"
+    for name in ("vcan", "socketcan:vcan0"):
+        assert choose_bus(name).reason == f"asked for; {SMALL}"
+
+
+def test_auto_takes_the_hub_without_any_vcan(can_kernel_without_vcan0, trial):
+    trial("this is why")
+    choice = choose_bus("auto")
+    assert choice.name == "hub:vcan0"
+    assert choice.reason == "there is no network interface 'vcan0' for CAN; this is why"
 
 
 def test_auto_takes_the_hub_without_can(no_can_kernel):
@@ -122,13 +176,14 @@ def test_auto_takes_the_hub_where_there_is_no_address_family(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name", ["", "hub:", ":x", "virtual", "virtual:", "socketcan", "socketcan:"]
+    "name", ["", "hub:", ":x", "vcan:", "virtual", "virtual:", "socketcan", "socketcan:"]
 )
 def test_malformed_names(name):
     with pytest.raises(BusError) as failure:
         open_bus(name)
     assert str(failure.value) == (
-        f"bus {name!r}: expected auto, hub, hub:CHANNEL, vcan, socketcan:NAME or INTERFACE:CHANNEL"
+        f"bus {name!r}: expected auto, hub, vcan, hub:CHANNEL, vcan:CHANNEL, socketcan:NAME or"
+        " INTERFACE:CHANNEL"
     )
 
 
@@ -166,41 +221,28 @@ def test_a_missing_interface_on_this_machine(channel):
         open_bus(f"socketcan:{channel}")
 
 
-def test_vcan_says_why_not():
-    reason = private_vcan_reason()
-    assert reason
-    assert "\n" not in reason
+def test_a_private_vcan_without_can(no_can_kernel):
     with pytest.raises(BusError) as failure:
         open_bus("vcan")
-    assert str(failure.value) == f"bus 'vcan': cannot have a private vcan: {reason}"
+    assert str(failure.value) == (
+        "bus 'vcan': cannot have a private vcan: this kernel has no SocketCAN"
+    )
 
 
-@pytest.mark.parametrize(
-    ("release", "file", "text", "known"),
-    [
-        (
-            "modules.dep",
-            True,
-            "kernel/drivers/net/can/vcan.ko.xz: kernel/net/can/can.ko.xz\n",
-            True,
-        ),
-        ("modules.builtin", True, "kernel/drivers/net/can/vcan.ko\n", True),
-        ("modules.dep", True, "kernel/drivers/net/can/vxcan.ko: kernel/net/can/can.ko\n", False),
-        ("modules.dep", False, "", False),
-    ],
-)
-def test_the_module_vcan_is_looked_for(
-    can_kernel_without_vcan0, monkeypatch, tmp_path, release, file, text, known
-):
-    if file:
-        (tmp_path / release).write_text(text)
-    real_path = bus_module.Path
+def test_a_private_vcan_that_cannot_be_made(monkeypatch, runtime_dir, trial):
+    monkeypatch.setattr("can_dbc.bus.socketcan_reason", lambda channel: "")
+    trial("this is why")
+    assert private_vcan_reason() == "this is why"
+    with pytest.raises(BusError) as failure:
+        open_bus("vcan")
+    assert str(failure.value) == (
+        "bus 'vcan': cannot open vcan:vcan0: atovcan: cannot start a private vcan: this is why"
+    )
 
-    def moved(*parts: str) -> object:
-        return tmp_path if parts[0] == "/lib/modules" else real_path(tmp_path, "not there")
 
-    monkeypatch.setattr(bus_module, "Path", moved)
-    assert (private_vcan_reason() == "this kernel has no module vcan") is not known
+def test_the_trial_cannot_be_started(can_kernel_without_vcan0, monkeypatch):
+    monkeypatch.setattr("sys.executable", "/nowhere/python")
+    assert private_vcan_reason().startswith("cannot try: [Errno 2]")
 
 
 def test_a_driver_that_raises_gives_one_line(monkeypatch):
@@ -236,28 +278,6 @@ def test_configuration_files_do_not_count(monkeypatch, tmp_path):
     with open_bus("virtual:ini") as bus:
         send_frames(bus, [(1, 1)])
         assert recv_frames(bus, 0) == []
-
-
-def test_the_receive_buffer_is_enlarged():
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as own:
-        before = own.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        bus_module._enlarge_receive_buffer(SimpleNamespace(socket=own))
-        assert own.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) >= before
-
-
-def test_the_receive_buffer_is_enlarged_without_root():
-    calls = []
-
-    def setsockopt(level: int, option: int, value: int) -> None:
-        if option == bus_module._SO_RCVBUFFORCE:
-            raise PermissionError
-        calls.append((level, option))
-        assert value > 10**7
-
-    fake = SimpleNamespace(socket=SimpleNamespace(setsockopt=setsockopt))
-    bus_module._enlarge_receive_buffer(fake)
-    assert calls == [(socket.SOL_SOCKET, socket.SO_RCVBUF)]
 
 
 def test_a_name_too_long_for_an_interface():

@@ -17,7 +17,7 @@ from pathlib import Path
 import can
 import pytest
 
-from can_dbc import hub, hub_server
+from can_dbc import hub, hub_server, rendezvous
 from can_dbc.hub import FOREIGN, HubBus, socket_path
 
 TIMEOUT_S = 10.0
@@ -210,7 +210,7 @@ def test_a_hub_that_stands_still_takes_only_so_much(node):
 
 def test_a_hub_that_does_not_answer(node, monkeypatch):
     bus = node()
-    monkeypatch.setattr(hub, "_CONNECT_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(rendezvous, "CONNECT_TIMEOUT_S", 0.05)
     os.kill(bus.hub_pid, signal.SIGSTOP)
     try:
         with pytest.raises(can.CanInitializationError, match=r"does not answer within 0\.05 s"):

@@ -255,6 +255,51 @@ def test_a_second_process_compiles_nothing(tmp_path: Path) -> None:
     assert all(hits == 1 and misses == 0 for hits, misses in second.values())
 
 
+CLOSURES = """
+import sys
+from can_dbc.codec import FORCE_CMD, get
+from can_dbc.step import step
+
+
+@step
+def force(word):
+    return get(word, FORCE_CMD.Force)
+
+
+def times(read, factor):
+    @step
+    def multiple(word):
+        return read(word) * factor
+
+    return multiple
+
+
+steps = [times(force, int(factor)) for factor in sys.argv[1:]]
+print([each(5 << FORCE_CMD.Force.start) for each in steps])
+print([sum(each.stats.cache_hits.values()) for each in steps])
+"""
+
+
+def test_a_closure_over_a_step_is_kept_and_told_from_others(tmp_path: Path) -> None:
+    (tmp_path / "closures.py").write_text(CLOSURES)
+
+    def run(*factors: str) -> list[list[int]]:
+        done = subprocess.run(
+            [sys.executable, "closures.py", *factors],
+            cwd=tmp_path,
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return [json.loads(line) for line in done.stdout.splitlines()]
+
+    assert run("2")[1] == [0]
+    values, hits = run("2", "3")
+    assert hits == [1, 0]
+    assert values[0] * 3 == values[1] * 2 != 0
+
+
 def test_the_cache_is_in_the_folder_of_the_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

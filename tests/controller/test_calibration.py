@@ -388,7 +388,9 @@ def test_a_law_that_is_gone_is_named(path):
         calibration.load(path)
 
 
-@pytest.mark.parametrize("name", ["ailc", "adaptive", "cailc", "pdilc", "pid"])
+@pytest.mark.parametrize(
+    "name", ["ailc", "adaptive", "cailc", "iplc", "norm-optimal", "pdilc", "pid"]
+)
 def test_every_law_file_has_what_the_house_expects(name):
     module = load_law(name)
     assert module.PARAMS.isalignedstruct

@@ -20,7 +20,7 @@ INT32 = st.integers(-(2**31), 2**31 - 1)
 @step
 def run_ticks(params: Any, state: Any, stored: Any, cell: Any, learn: Any, before: Any) -> None:
     """One run: learn [ticks, words] goes in, before [ticks, words] comes out."""
-    memory.rewind(params[0], state[0], cell[0])
+    memory.rewind(params[0], state[0], stored, cell[0])
     for k in range(len(learn)):
         memory.gather(params[0], state[0], stored, cell[0])
         for w in range(learn.shape[1]):
@@ -287,3 +287,107 @@ def test_no_value_overflows(interpreted, values, learned, grid):
     assert cells[0] == cells[1]
     assert (mine.stored == checked.stored).all()
     assert mine.state == checked.state
+
+
+# A law that recalls the last run.
+
+
+def recalling(words=3, cells=5, ahead=1, smooth=0, smooth_word=2, late_word=3):
+    params = settings_of(words=words, cells=cells, initial=0)
+    params["recall"] = 1
+    params["ahead"], params["late_word"] = ahead, late_word
+    params["smooth"], params["smooth_word"] = smooth, smooth_word
+    params["smooth_weight"] = round(2**30 / (2 * smooth + 1))
+    return params
+
+
+@step
+def recall_ticks(params: Any, state: Any, stored: Any, cell: Any, learn: Any, seen: Any) -> None:
+    """One run: learn [ticks, words] goes in; before, ahead and smooth come out in one row."""
+    memory.rewind(params[0], state[0], stored, cell[0])
+    words = learn.shape[1]
+    for k in range(len(learn)):
+        memory.gather(params[0], state[0], stored, cell[0])
+        for w in range(words):
+            seen[k, w] = cell[0].before[w]
+            cell[0].learn[w] = learn[k, w]
+        seen[k, words] = cell[0].ahead[0]
+        seen[k, words + 1] = cell[0].ahead[1]
+        seen[k, words + 2] = cell[0].smooth
+        memory.scatter(params[0], state[0], stored, cell[0])
+
+
+class Recalling(Memory):
+    """The same for a law that recalls."""
+
+    def run(self, learn, keep=True):
+        learn = np.array(learn, np.int64)
+        seen = np.zeros((len(learn), learn.shape[1] + 3), np.int64)
+        memory.start_run(self.state[0], self.stored)
+        recall_ticks(self.params, self.state, self.stored, np.zeros(1, CELL), learn, seen)
+        memory.end_run(self.params[0], self.state[0], self.stored, keep)
+        return seen
+
+
+def test_what_a_run_leaves_replaces_what_was_there():
+    mine = Recalling(recalling(cells=3))
+    mine.run([[1, 2, 3], [4, 5, 6], [7, 8, 9]])
+    mine.run([[10, 20, 30], [40, 50, 60], [70, 80, 90]])
+    assert mine.values == [[10, 20, 30], [40, 50, 60], [70, 80, 90]]
+
+
+def test_words_of_the_tick_before_are_stored_there():
+    mine = Recalling(recalling(cells=4, late_word=1))
+    mine.run([[1, 91, 92], [2, 10, 100], [3, 20, 200], [4, 30, 300]])
+    assert mine.values == [[1, 10, 100], [2, 20, 200], [3, 30, 300], [4, 0, 0]]
+
+
+@given(
+    st.integers(1, 30).flatmap(
+        lambda ticks: st.tuples(
+            st.binary(min_size=12 * ticks, max_size=12 * ticks),
+            st.binary(min_size=12 * ticks, max_size=12 * ticks),
+        )
+    ),
+    st.integers(0, 40),
+    st.integers(0, memory.SMOOTH_MAX),
+)
+def test_a_run_sees_the_last_one_whole(contents, ahead, smooth):
+    first, second = (np.frombuffer(c, np.int32).reshape(-1, 3) for c in contents)
+    ticks = len(first)
+    mine = Recalling(recalling(cells=ticks, ahead=ahead, smooth=smooth))
+    mine.run(first)
+    for rows in (first, second):
+        seen = mine.run(second)
+        assert (seen[:, :3] == rows).all()
+        later = np.minimum(np.arange(ticks) + ahead, ticks - 1)
+        assert (seen[:, 3:5] == rows[later, :2]).all()
+        for k in range(ticks):
+            around = np.clip(np.arange(k - smooth, k + smooth + 1), 0, ticks - 1)
+            mean = Fraction(int(rows[around, 2].astype(np.int64).sum()), 2 * smooth + 1)
+            # The weight is rounded to 2^-30, the result to an integer.
+            assert abs(seen[k, 5] - mean) <= Fraction(1, 2) + Fraction(2 * smooth + 1, 1)
+        if smooth == 0:
+            assert (seen[:, 5] == rows[:, 2]).all()
+
+
+def test_a_dropped_run_is_not_recalled():
+    mine = Recalling(recalling(cells=2))
+    mine.run([[1, 2, 3], [4, 5, 6]])
+    mine.run([[7, 7, 7], [7, 7, 7]], keep=False)
+    assert mine.run([[0, 0, 0]] * 2)[:, :3].tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_no_recalled_value_overflows(interpreted):
+    params = recalling(cells=2, smooth=memory.SMOOTH_MAX, ahead=1)
+    mine, checked = Recalling(params), Recalling(params)
+    for each in (mine, checked):
+        each.stored[:] = -(2**31)
+    cells = [np.zeros(1, CELL), np.zeros(1, CELL)]
+    memory.rewind(params[0], mine.state[0], mine.stored, cells[0][0])
+    interpreted("controller.memory:rewind", params, checked.state, checked.stored, cells[1])
+    for _ in range(3):
+        memory.gather(params[0], mine.state[0], mine.stored, cells[0][0])
+        interpreted("controller.memory:gather", params, checked.state, checked.stored, cells[1])
+    assert cells[0] == cells[1]
+    assert abs(int(cells[0]["smooth"][0]) + 2**31) <= 2 * memory.SMOOTH_MAX + 2

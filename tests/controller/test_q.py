@@ -57,12 +57,27 @@ def test_a_division_by_zero_gives_zero(numerator):
     assert q.divide_round(numerator, 0) == 0
 
 
+@given(st.integers(0, 40 << 24) | st.integers(0, 2**62 - 1))
+def test_exp2_minus(x):
+    exact = 2.0 ** (-x / 2**24)
+    assert abs(q.exp2_minus(x) / ONE - exact) < 1e-8
+    assert 0 <= q.exp2_minus(x) <= ONE
+
+
+def test_exp2_minus_never_rises():
+    values = [q.exp2_minus(x) for x in range(0, 40 << 24, 99_991)]
+    assert values == sorted(values, reverse=True)
+    assert values[0] == ONE
+    assert values[-1] == 0
+
+
 @given(st.integers(0, ONE))
 def test_the_interpreter_agrees(interpreted, s):
     assert interpreted("controller.q:sin_half_pi", s) == q.sin_half_pi(s)
     assert interpreted("controller.q:divide_round", s, 0) == 0
     assert interpreted("controller.q:divide_round", -s, 7) == q.divide_round(-s, 7)
     assert interpreted("controller.q:round_shift", -s, 3) == q.round_shift(-s, 3)
+    assert interpreted("controller.q:exp2_minus", s) == q.exp2_minus(s)
 
 
 @njit

@@ -276,8 +276,12 @@ def test_work_of_traction_is_kinetic_energy_and_heat():
     assert rig.train["traction_j"] == pytest.approx(kinetic, rel=2e-3)
     work = rig.train["traction_j"].copy()
     assert work > kinetic
+    assert rig.train["braking_j"] == 0
+    before = rig.train["position_m"]
     rig.run(np.full(6, -2e4), 100)
     assert rig.train["traction_j"] == work
+    way = rig.train["position_m"] - before
+    assert rig.train["braking_j"] == pytest.approx(6 * 2e4 * way, rel=2e-3)
 
 
 @pytest.mark.parametrize("change", [{"coupler_stiffness_n_m": 0.0}, {"coupler_damping_n_s_m": 0.0}])

@@ -180,8 +180,10 @@ def test_work_of_traction_is_force_times_way():
     rig = Rig()
     positions, _ = rig.run(1.5e5, 500)
     assert rig.train["traction_j"] == pytest.approx(1.5e5 * positions[-1], rel=1e-9)
-    rig.run(-1e5, 100)
+    assert rig.train["braking_j"] == 0
+    braked, _ = rig.run(-1e5, 100)
     assert rig.train["traction_j"] == pytest.approx(1.5e5 * positions[-1], rel=1e-9)
+    assert rig.train["braking_j"] == pytest.approx(1e5 * (braked[-1] - positions[-1]), rel=1e-9)
 
 
 def test_the_rear_follows_rigidly():

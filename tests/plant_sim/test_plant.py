@@ -251,6 +251,16 @@ def test_truth_is_the_state_at_the_tick_and_the_force_over_it():
     assert rows[2]["traction_j"] == pytest.approx(1e5 * rows[2]["position_m"])
 
 
+def test_part_of_the_braking_work_comes_back():
+    rig = Rig("gradient")
+    rig.train["speed_m_s"] = 20.0
+    rig.receive(FORCE_CMD, Force=-1e5)
+    rows = [rig.advance() for _ in range(50)]
+    assert rows[-1]["traction_j"] == 0
+    assert rows[-1]["braking_j"] > rows[-2]["braking_j"] > 0
+    assert rows[-1]["recuperated_j"] == pytest.approx(0.7 * rows[-1]["braking_j"])
+
+
 def test_truth_shows_the_couplers():
     rig = Rig(DEFAULT)
     for _ in range(3):

@@ -167,8 +167,12 @@ def test_it_reports_the_mean_acceleration_of_a_period_and_its_work():
     assert acceleration[1:] == pytest.approx(np.diff(speed) / PERIOD_S, abs=1e-9)
     train = state["train"]
     assert train["traction_j"] == pytest.approx(200e3 * train["position_m"], rel=1e-4)
+    assert train["braking_j"] == 0
     *_, state = run(train_of(), np.full(100, -50e3), speed_m_s=20.0)
     assert state["train"]["traction_j"] == 0
+    assert state["train"]["braking_j"] == pytest.approx(
+        50e3 * state["train"]["position_m"], rel=1e-4
+    )
 
 
 def test_it_starts_where_it_is_told():

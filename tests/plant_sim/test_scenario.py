@@ -5,7 +5,15 @@ import tomllib
 
 import pytest
 
-from plant_sim.scenario import FOLDER, ScenarioError, find, load, scenario_names
+from plant_sim.scenario import (
+    FOLDER,
+    ScenarioError,
+    case_names,
+    find,
+    load,
+    overlaid,
+    scenario_names,
+)
 from plant_sim.trains import couplers, lumped
 
 
@@ -125,6 +133,14 @@ MISTAKES = [
         'base = "subway"\n[profile]\nlimits = []',
         r"key profile\.limits: expected at least one limit",
     ),
+    (
+        'base = "subway"\n[profile]\nlimit_above_m_s = 0.5',
+        r"key profile: a plan takes only one of limits and limit_above_m_s",
+    ),
+    (
+        'base = "subway"\n[run_length]\nshortest_s = 9.0\nlongest_s = 8.0',
+        r"key run_length: longest_s is 8, expected shortest_s or more, 9",
+    ),
     ('base = "subway"\n[profile]\ndistance_m = 9e3', r"\[profile\]: distance_m = 9000 is out .*"),
 ]
 
@@ -165,3 +181,103 @@ def test_a_file_that_is_no_text_is_named(tmp_path):
 def test_every_packaged_scenario_says_what_it_is():
     for path in FOLDER.glob("*.toml"):
         assert "title" in tomllib.loads(path.read_text()), path
+
+
+# Named cases.
+
+CASES = """
+base = "subway-paper"
+runs = 3
+[cases.slow]
+title = "Slow learning"
+laws.cailc = { alpha = 2.0 }
+[cases.noisy]
+sensors.speed_noise_m_s = 0.01
+"""
+
+
+@pytest.mark.parametrize("name", case_names())
+def test_a_packaged_case_loads_and_says_what_it_is(name):
+    loaded = load(name)
+    assert loaded.name == name
+    assert loaded.scenario.title
+
+
+def test_the_paper_s_cases_are_cases_of_both_gradients():
+    paper = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII")
+    assert load("gradient").cases == load("gradient-paper").cases == paper
+    titles = {load(f"gradient:{case}").scenario.title for case in paper}
+    assert len(titles) == 8
+    assert load("gradient-paper:VI").scenario.actuator.delay_ticks == 0
+    assert load("gradient:VI").scenario.actuator.delay_ticks == 1
+
+
+def test_a_case_replaces_what_it_states(write):
+    path = write(CASES)
+    plain, slow, noisy = load(path), load(f"{path}:slow"), load(f"{path}:noisy")
+    assert plain.cases == slow.cases == ("slow", "noisy")
+    assert (slow.name, slow.folder_name, slow.scenario.title) == (
+        "mine:slow",
+        "mine-slow",
+        "Slow learning",
+    )
+    assert slow.scenario.laws["cailc"] == plain.scenario.laws["cailc"] | {"alpha": 2.0}
+    assert noisy.scenario.laws == plain.scenario.laws
+    assert noisy.scenario.sensors.speed_noise_m_s == 0.01
+    assert slow.scenario.runs == 3
+    assert len({plain.digest, slow.digest, noisy.digest}) == 3
+
+
+def test_a_case_loads_again_from_its_source(write):
+    slow = load(f"{write(CASES)}:slow")
+    assert load(slow.source).digest == slow.digest
+    assert load(load("subway").source).digest == load("subway").digest
+
+
+def test_a_memory_outlives_a_change_of_the_cases(write):
+    digest = load(write(CASES)).digest
+    assert load(write(CASES.replace("alpha = 2.0", "alpha = 3.0"), "other.toml")).digest == digest
+
+
+def test_a_base_can_be_a_case_and_hands_the_cases_on(write):
+    write(CASES)
+    path = write('base = "mine.toml:slow"\nruns = 5\n', "upon.toml")
+    assert load(path).scenario.laws["cailc"]["alpha"] == 2.0
+    assert load(f"{path}:noisy").scenario.sensors.speed_noise_m_s == 0.01
+    assert load(f"{path}:noisy").scenario.runs == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        (":fast", r"mine\.toml: case 'fast' is unknown, expected one of slow, noisy"),
+        (":", r"mine\.toml:: expected the name of a case after the colon"),
+    ],
+)
+def test_an_unknown_case_lists_the_known_ones(name, says, write):
+    with pytest.raises(ScenarioError, match=says):
+        load(write(CASES) + name)
+
+
+def test_a_scenario_without_cases_says_so():
+    with pytest.raises(ScenarioError, match="case 'I' is unknown, the scenario has none"):
+        load("subway:I")
+
+
+def test_a_mistake_in_a_case_names_the_case(write):
+    path = write(CASES.replace("speed_noise_m_s", "speed_nose_m_s"))
+    assert load(f"{path}:slow").scenario.runs == 3
+    with pytest.raises(ScenarioError, match=r"mine\.toml, case noisy: key sensors: .*speed_nose"):
+        load(f"{path}:noisy")
+
+
+def test_cases_are_tables(write):
+    with pytest.raises(ScenarioError, match=r"key cases: expected tables, \[cases\.NAME\]"):
+        load(write('base = "subway-paper"\ncases.I = 3\n'))
+
+
+def test_an_overlay_is_what_a_file_would_state():
+    loaded = overlaid("gradient:VI", {"laws": {"iplc": {"S": 1.0}}, "runs": 2})
+    assert loaded.scenario.laws["iplc"] == load("gradient:VII").scenario.laws["iplc"]
+    assert loaded.scenario.runs == 2
+    assert load("gradient:VI").scenario.laws["iplc"]["S"] == 0.0

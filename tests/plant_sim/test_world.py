@@ -77,6 +77,48 @@ def test_load_is_uniform_and_held(variant, hold):
     assert values.var() == pytest.approx(0.01**2 / 3, rel=0.2)
 
 
+LENGTHS = "[run_length]\nshortest_s = 150.0\nlongest_s = 210.0\n"
+
+
+def test_run_lengths_are_uniform_and_end_with_the_profile(variant):
+    loaded = variant(LENGTHS)
+    ticks = np.array([world.run_ticks(loaded, 1, run) for run in range(2000)])
+    assert ticks.min() >= 15_001
+    assert (ticks == loaded.ticks).mean() == pytest.approx(1 / 3, abs=0.05)  # 190 s of 150 to 210
+    early = ticks[ticks < loaded.ticks]
+    assert early.mean() == pytest.approx(17_000, abs=100)
+    again = [world.run_ticks(loaded, 1, run) for run in range(2000)]
+    assert again == ticks.tolist()
+    assert world.run_ticks(loaded, 2, 5) != ticks[5]
+
+
+def test_without_lengths_every_run_is_whole(variant):
+    assert {world.run_ticks(variant(""), 1, run) for run in range(10)} == {19_001}
+
+
+def test_the_first_run_may_have_a_length_of_its_own(variant):
+    loaded = variant(LENGTHS + "first_s = 173.21\n")
+    plain = variant(LENGTHS, "plain")
+    assert world.run_ticks(loaded, 1, 1) == 17_322  # both ends included
+    assert world.run_ticks(loaded, 1, 2) == world.run_ticks(plain, 1, 2)
+
+
+def test_chance_does_not_depend_on_when_the_run_ends(variant):
+    whole = world.chance(variant(NOISE + LOAD, "whole"), 1, 3)
+    cut = world.chance(variant(NOISE + LOAD + LENGTHS, "cut"), 1, 3)
+    assert len(cut) < len(whole)
+    assert (cut == whole[: len(cut)]).all()
+
+
+def test_a_limit_can_follow_the_reference(variant):
+    loaded = variant("[profile]\nlimits = []\nlimit_above_m_s = 0.5\n")
+    limits = world.limits_of(loaded)
+    at = np.searchsorted(limits["until_tick"], np.arange(loaded.ticks))
+    expected = loaded.profile.speed_m_s + 0.5
+    assert (limits["speed_m_s"][at] == expected).all()
+    assert len(limits) < loaded.ticks  # a cruise takes one row
+
+
 def test_params_are_those_of_the_scenario():
     here = world.build(load("subway"), 1)
     node, actuators = here.params["node"][0], here.params["actuator"][0]

@@ -81,7 +81,7 @@ def test_compare_lays_laws_side_by_side(tmp_path: Path) -> None:
     [
         (["compare", "subway", "--laws", "cailc,magic"], "no gains for law 'magic'"),
         (["compare", "nowhere", "--laws", "cailc"], "scenario 'nowhere' is unknown"),
-        (["claims", "nothing"], "no claims of 'nothing', expected one of cailc, drac"),
+        (["claims", "nothing"], "no claims of 'nothing', expected one of afilc, cailc, drac"),
         (["claims", "cailc", "--json", "no/such/file.json"], "no/such/file.json: no such folder"),
         (["replay", "none.blf"], "none.blf: cannot be read: No such file or directory"),
         (["decode", "none.log", "--out", "x.csv"], "none.log: cannot be read: No such file"),
@@ -121,7 +121,9 @@ def test_a_command_that_differs_ends_the_replay(recorded: Path, tmp_path: Path) 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("paper", "least"), [("cailc", 20), ("drac", 15)])
+@pytest.mark.parametrize(
+    ("paper", "least"), [("cailc", 20), ("drac", 15), ("afilc", 20), ("iplc", 25)]
+)
 def test_the_claims_of_a_paper_come_out_as_found(tmp_path: Path, paper: str, least: int) -> None:
     done = ato_hil("claims", paper, "--json", "claims.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -75,6 +75,20 @@ def test_run_and_tick_are_those_of_the_session(recorded: Path, tmp_path: Path) -
     assert set(table["intact"].to_pylist()) == {True}
 
 
+def test_a_recording_that_begins_within_a_run_knows_its_tick(
+    recorded: Path, tmp_path: Path
+) -> None:
+    lines = recorded.read_text().splitlines(keepends=True)
+    (tmp_path / "late.log").write_text("".join(lines[3000:]))
+    decode(tmp_path / "late.log", tmp_path / "x.parquet")
+    table = parquet.read_table(tmp_path / "x.parquet")
+    rows = [row for row in table.to_pylist() if row["run"] is not None]
+    assert rows[0]["tick"] > 600
+    for row in rows:
+        if row["message"] == "FORCE_CMD":
+            assert row["tick"] == row["FORCE_CMD.Tick"]
+
+
 def test_csv_and_parquet_hold_the_same(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -307,3 +307,4 @@ def test_measured_truth_is_what_the_bus_shows() -> None:
     assert truth["position_m"].tolist() == [0.0, 1.0, 2.0]
     assert truth["force_n"].tolist() == [10.0, 10.0, -10.0]
     assert truth["traction_j"] == pytest.approx([0.1, 0.2, 0.2])
+    assert truth["braking_j"] == pytest.approx([0.0, 0.0, 0.3])

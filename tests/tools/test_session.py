@@ -85,6 +85,29 @@ def test_hil_gives_the_bits_of_sil(short: Path, tmp_path: Path) -> None:
     assert (tmp_path / "hil" / "trace.rrd").stat().st_size > 100_000
 
 
+def test_runs_of_different_length_are_no_fault(tmp_path: Path) -> None:
+    """Each is cut while the train still moves; the next goes on from what it learned."""
+    path = tmp_path / "lengths.toml"
+    path.write_text(
+        SHORT.format(more="[run_length]\nshortest_s = 10.0\nlongest_s = 16.0\nfirst_s = 11.5")
+    )
+    options = ("run", str(path), "--runs", "3", "--no-trace")
+    sil = ato_hil(*options, "--mode", "sil", "--out", "sil", cwd=tmp_path)
+    assert sil.returncode == 0, sil.stderr
+    hil = ato_hil(*options, "--bus", channel(tmp_path), "--out", "hil", cwd=tmp_path)
+    assert hil.returncode == 0, hil.stderr
+    one, other = summary(tmp_path / "sil"), summary(tmp_path / "hil")
+    assert one["digest"] == other["digest"]
+    ticks = [row["ticks"] for row in one["runs"]]
+    assert ticks == [row["ticks"] for row in other["runs"]]
+    assert ticks[0] == 1151
+    assert len(set(ticks)) == 3
+    assert max(ticks) < 1602
+    assert [row["faults"] for row in other["runs"]] == [[], [], []]
+    assert other["controller"] == one["controller"]
+    assert one["controller"]["memory_bytes"] > 0
+
+
 def test_the_summary_has_its_stable_keys(short: Path, tmp_path: Path) -> None:
     done = ato_hil(
         "run", str(short), "--mode", "sil", "--no-trace", "--seed", "7", "--out", "o", cwd=tmp_path
@@ -111,6 +134,7 @@ def test_the_summary_has_its_stable_keys(short: Path, tmp_path: Path) -> None:
         *("run", "ticks", "max_delta_m_s", "max_speed_error_m_s", "max_position_error_m"),
         *("rms_speed_error_m_s", "rms_position_error_m", "stop_error_m", "max_acceleration_m_s2"),
         *("rms_command_jerk_m_s3", "overspeed_margin_m_s", "energy_kwh_per_t", "ticks_per_s"),
+        *("braking_kwh_per_t", "recuperated_kwh_per_t", "net_energy_kwh_per_t"),
         "faults",
     } <= set(found["runs"][0])
     assert found["runs"][0]["ticks"] == 2001

@@ -99,8 +99,10 @@ def differences(law: str, reference: Reference, loaded: Loaded) -> tuple[float, 
     with sensors that only the DBC quantises: a coarser grid would blow a last bit up to a step."""
     module = load_law(law)
     loaded = ideal_sensors(loaded)
-    shadow, truth = _runs(module, reference, loaded, law, drive=0)
-    _follows, real = _runs(module, reference, loaded, law, drive=1)
+    numbers = setup.run_numbers(law, RUNS)
+    shadow, truths = _runs(module, reference, loaded, law, numbers, drive=0)
+    _follows, reals = _runs(module, reference, loaded, law, numbers, drive=1)
+    truth, real = np.concatenate(truths, axis=1), np.concatenate(reals, axis=1)
     mass = loaded.scenario.train.mass_kg
     return (
         shadow * mass,
@@ -119,14 +121,25 @@ def ideal_sensors(loaded: Loaded) -> Loaded:
     )
 
 
+def reference_runs(law: str, reference: Reference, loaded: Loaded, runs: int) -> list[np.ndarray]:
+    """The leader's truth of each run with the float64 law in the loop."""
+    numbers = setup.run_numbers(law, runs)
+    truths = _runs(load_law(law), reference, loaded, law, numbers, drive=1)[1]
+    return [truth[0] for truth in truths]
+
+
 def _runs(
-    module: ModuleType, reference: Reference, loaded: Loaded, law: str, drive: int
-) -> tuple[float, np.ndarray]:
-    """Largest difference of the force (m/s^2), and the truth of all runs, [trains, ticks]."""
+    module: ModuleType,
+    reference: Reference,
+    loaded: Loaded,
+    law: str,
+    numbers: range,
+    drive: int,
+) -> tuple[float, list[np.ndarray]]:
+    """Largest difference of the force (m/s^2), and the truth of each run, [trains, ticks]."""
     pairs = [_pair(module, reference, train, law, drive) for train in members(loaded)]
     truth = []
     kept = [pair.state["law"]["real"]["memory"].copy() for pair in pairs]
-    numbers = setup.run_numbers(law, RUNS)
     for results in sil.run_line(loaded, pairs, runs=numbers, seed=identity.SEED):
         truth.append(np.stack([result.truth for result in results]))
         for train, pair in enumerate(pairs):
@@ -135,8 +148,7 @@ def _runs(
                 pair.state["law"]["real"]["memory"] = kept[train]
             else:
                 kept[train] = pair.state["law"]["real"]["memory"].copy()
-    largest = max(float(pair.state["law"]["difference"][0]) for pair in pairs)
-    return largest, np.concatenate(truth, axis=1)
+    return max(float(pair.state["law"]["difference"][0]) for pair in pairs), truth
 
 
 def _pair(

@@ -231,7 +231,7 @@ def reference_loop(n: Any, params: Any, profile: Any, state: Any) -> None:
 @step
 def memory_loop(n: Any, params: Any, state: Any, cells: Any) -> None:
     """Gather and scatter, from the start of a run."""
-    memory.rewind(params[0].memory, state[0].memory, state[0].cell)
+    memory.rewind(params[0].memory, state[0].memory, cells, state[0].cell)
     for _ in range(n):
         memory.gather(params[0].memory, state[0].memory, cells, state[0].cell)
         memory.scatter(params[0].memory, state[0].memory, cells, state[0].cell)
@@ -288,7 +288,7 @@ def check_parts(law: str) -> Iterator[Row]:
         """A run from its start."""
         state["core"]["run_state"] = RUNNING
         state["core"]["tick"] = 0
-        memory.rewind(params[0]["memory"], state[0]["memory"], state[0]["cell"])
+        memory.rewind(params[0]["memory"], state[0]["memory"], cells, state[0]["cell"])
 
     tick = build_tick_loop(here.tick)
 

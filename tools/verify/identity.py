@@ -19,7 +19,7 @@ import numpy as np
 from can_dbc.bus import socketcan_reason
 from can_dbc.hub import DEFAULT_CHANNEL
 from controller.registry import is_file, load_law
-from plant_sim.scenario import Loaded, load, members, scenario_names
+from plant_sim.scenario import Loaded, case_names, load, members, scenario_names
 from tools import line, setup, sil
 from tools.frames import LineDigest
 from tools.verify import ABSENT, FAILED, Row, VerifyError, row
@@ -64,11 +64,17 @@ def shortened(loaded: Loaded, ticks: int) -> Loaded:
 
 
 def scenarios_of(law: str) -> list[str]:
-    """The packaged scenarios that have gains for a law; for a law in a file of its own the one that
-    its SCENARIO names, the default scenario without."""
+    """The packaged scenarios that have gains for a law, and the cases whose default law it is: they
+    are about that one; for a law in a file of its own the one that its SCENARIO names, the default
+    scenario without."""
     if is_file(law):
         return [getattr(load_law(law), "SCENARIO", OWN_LAW_SCENARIO)]
-    return [name for name in scenario_names() if law in load(name).scenario.laws]
+    return [
+        name
+        for name in case_names()
+        if law in load(name).scenario.laws
+        and (not load(name).case or law == load(name).scenario.law)
+    ]
 
 
 def scenario_of(law: str) -> str:

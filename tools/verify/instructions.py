@@ -48,19 +48,23 @@ def check(law: str) -> Iterator[Row]:
         if shutil.which(tool) is None:
             yield Row(name, law, how, f"this machine has no {tool}", ABSENT)
             return
+    calibrations = overflow.calibrated(law)
     try:
-        counts = count(load_law(law), overflow.calibrated(law))
+        counts = count(load_law(law), calibrations)
     except ToolError as error:
         yield Row(name, law, how, str(error), FAILED)
         return
-    ratio = max(counts) / min(counts)
+    # What a calibration takes depends on its gains, a call of it not on the data.
+    alike = [counts[first :: len(calibrations)] for first in range(len(calibrations))]
+    ratio = max(max(some) / min(some) for some in alike)
     bound = RATIO_MAX_OF.get(law, RATIO_MAX)
-    text = f"{min(counts)} to {max(counts)}, ratio {ratio:.2f}, bound {bound}"
+    text = f"{min(counts)} to {max(counts)}, ratio {ratio:.2f} at the same gains, bound {bound}"
     yield row(name, law, how, text, ratio <= bound)
 
 
 def count(module: ModuleType, params: list[np.ndarray]) -> list[int]:
-    """Instructions of each of CASES calls of a law. Raises ToolError."""
+    """Instructions of each of CASES calls of a law, case after case; the calibrations take turns.
+    Raises ToolError."""
     with tempfile.TemporaryDirectory(prefix="ato-hil-verify-") as scratch:
         folder = Path(scratch)
         (folder / "step.o").write_bytes(_object(native.law(module)))
@@ -71,7 +75,8 @@ def count(module: ModuleType, params: list[np.ndarray]) -> list[int]:
             ["valgrind", *CALLGRIND, "./run", "cases", *map(str, sizes)],
             folder,
         )
-        counts = [_total(path) for path in folder.glob("counts.*")]
+        dumps = sorted(folder.glob("counts.*"), key=lambda path: int(path.suffix[1:]))
+        counts = [_total(path) for path in dumps]
     counts = [c for c in counts if c > 0]
     if len(counts) != CASES:
         raise ToolError(f"callgrind counted {len(counts)} calls, expected {CASES}")

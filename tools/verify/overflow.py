@@ -139,9 +139,10 @@ def search(module: Any, params: list[np.ndarray], cases: int) -> Report:
         except (OverflowError, ZeroDivisionError, ValueError, TypeError) as error:
             return Report(error=f"{where(error)} ({_show(records)})", cases=case + 1)
         for name, (low, high) in bounds.items():
-            if not low <= int(state[name]) <= high:
+            values = np.atleast_1d(state[name])
+            if values.min() < low or values.max() > high:
                 text = f"{place(module.__file__)}: state.{name} left its STATE_BOUNDS"
-                text += f": {int(state[name])} ({_show(records)})"
+                text += f": {state[name]} ({_show(records)})"
                 return Report(error=text, cases=case + 1)
         if peaks.magnitude() > largest:  # over all cases so far: grows only with a new record
             largest, best = peaks.magnitude(), records

@@ -90,7 +90,7 @@ def test_learning_in_the_memory_adds_the_errors_of_all_runs(vehicle, inputs_of, 
     for iteration, eps in enumerate(runs):
         cells = np.zeros(ticks, CELL)
         memory.start_run(state[0], stored)
-        memory.rewind(grid[0], state[0], cells[0])
+        memory.rewind(grid[0], state[0], stored, cells[0])
         cells["before"][:, 0] = stored[state["generation"][0], :, 0]
         inputs = run_inputs(inputs_of, iteration, eps)
         outputs, cells, _ = run_law("pdilc", params, inputs, None, cells)

@@ -2,6 +2,12 @@
 measured against. One file a paper."""
 
 from tools.verify.reference import Reference
-from tools.verify.references import cailc, drac, mtcc
+from tools.verify.references import afilc, cailc, drac, iplc, mtcc
 
-REFERENCES: dict[str, Reference] = {**cailc.REFERENCES, **drac.REFERENCES, **mtcc.REFERENCES}
+REFERENCES: dict[str, Reference] = {
+    **cailc.REFERENCES,
+    **drac.REFERENCES,
+    **afilc.REFERENCES,
+    **iplc.REFERENCES,
+    **mtcc.REFERENCES,
+}
