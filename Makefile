@@ -12,7 +12,7 @@ PYTHON ?= python3
 SCENARIO ?= subway
 RUNS ?= 10
 PYTEST_ARGS ?=
-GUEST_LIMIT_S ?= 1200
+GUEST_LIMIT_S ?= 1500
 
 RUN_READY := .venv/run.ready
 DEV_READY := .venv/dev.ready

@@ -108,13 +108,13 @@ def calibrate(
         raise CalibrationError(f"laws.{law_label(law)}: {error}") from None
     params["gradient_map"] = gradient_map.calibrate(map_sections)
     params["guard"] = _guard(guard_settings)
-    if line is not None:
-        _line(params, line, vehicle.period_s)
     ticks = int(profile["ticks"].sum()) + 1
     if recall is not None:
         preview_ticks = recall.ahead_ticks
         memory_settings = MemorySettings()
     params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
+    if line is not None:
+        _line(params, line, vehicle.period_s)
     params["memory"] = _memory(words, memory_settings, ticks)
     if recall is not None:
         _recall(params["memory"], recall)

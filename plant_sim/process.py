@@ -174,7 +174,7 @@ def one_run(
     stop: Stop,
 ) -> None:
     """Arms, drives and ends one run; its truth is written even if it is cut short."""
-    ticks = world.run_ticks(here.members[0], here.seed, run)
+    ticks = here.ticks(run)
     truth = np.zeros((len(buses), ticks), plant.TRUTH)
     file = out / f"truth_{run}.npy"
     for train, bus in enumerate(buses):

@@ -309,6 +309,11 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
     return loaded
 
 
+def _place(path: Path, case: str) -> str:
+    """Where a scenario's content is from, for messages."""
+    return f"{path}, case {case}" if case else str(path)
+
+
 def members(loaded: Loaded) -> list[Loaded]:
     """The scenario of each train of the line, the leader's first; of a single train, its own."""
     return [member(loaded, train) for train in range(loaded.trains)]
@@ -339,7 +344,7 @@ def _own_numbers(loaded: Loaded, line: Line, train: int) -> Scenario:
     """The scenario with what the line says of one train on top."""
     which = train % len(line.members)
     own = line.members[which]
-    where = f"{loaded.path}: key line.members[{which}]"
+    where = f"{_place(loaded.path, loaded.case)}: key line.members[{which}]"
     unknown = set(own.laws) - set(loaded.scenario.laws)
     if unknown:
         known = ", ".join(loaded.scenario.laws)
@@ -349,11 +354,6 @@ def _own_numbers(loaded: Loaded, line: Line, train: int) -> Scenario:
         return msgspec.convert(content, Scenario)
     except msgspec.ValidationError as error:
         raise ScenarioError(f"{where}: {_where(str(error))}") from None
-
-
-def _place(path: Path, case: str) -> str:
-    """Where a scenario's content is from, for messages."""
-    return f"{path}, case {case}" if case else str(path)
 
 
 def _where(message: str) -> str:

@@ -20,8 +20,9 @@ from plant_sim.trains import point
 from plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 # Chance: what a random number is drawn for; each gets a stream of its own, in each train.
-SPEED_NOISE, DISTURBANCE, RUN_LENGTH, LOST_AHEAD, LOST_BEHIND = 0, 1, 2, 3, 4
-STREAMS = 5  # of a train
+SPEED_NOISE, DISTURBANCE, LOST_AHEAD, LOST_BEHIND = 0, 1, 2, 3
+STREAMS = 4  # of a train
+RUN_LENGTH = LOST_AHEAD  # of a run: the leader has no train ahead whose packets are lost
 NEVER = 2**62  # tick
 
 
@@ -40,6 +41,10 @@ class World:
     track: Any  # [n] of track.SECTION
     rx: Any  # [trains, MESSAGE_COUNT] mailboxes
     tx: Any
+
+    def ticks(self, run: int) -> int:
+        """Control periods of a run."""
+        return run_ticks(self.members[0], self.seed, run)
 
 
 def rows(array: np.ndarray) -> Any:

@@ -410,13 +410,14 @@ def profile(
     own."""
     import numpy as np
 
-    from plant_sim.planner import limit_at
     from plant_sim.scenario import load
+    from plant_sim.world import limits_of
 
     with one_line_for_bad_input():
         loaded = load(scenario)
-        plan, reference = loaded.scenario.profile, loaded.profile
-        limit_m_s = limit_at(plan.limits, np.arange(loaded.ticks), loaded.scenario.period_s)
+    reference, limits = loaded.profile, limits_of(loaded)
+    row_of_tick = np.searchsorted(limits["until_tick"], np.arange(loaded.ticks))
+    limit_m_s = limits["speed_m_s"][np.minimum(row_of_tick, len(limits) - 1)]
     columns = {
         "position_m": reference.position_m,
         "speed_m_s": reference.speed_m_s,

@@ -168,7 +168,7 @@ def run_line(
 
     # Compiles, or loads what was compiled before.
     kinds = (plant.CHANCE, plant.TRUTH, FRAME)
-    drive(0, *(world.rows(np.zeros((trains, 1), kind)) for kind in kinds))
+    drive(0, *(world.rows(np.zeros((trains, 0), kind)) for kind in kinds))
     for number in runs:
         if progress:
             progress(number, 0)
@@ -187,7 +187,7 @@ def run_line(
         if progress:
             progress(number, ticks)
         yield [
-            RunResult(number, frames[train, : counts[train]], truth[train], faults[train], seconds)
+            RunResult(number, frames[train][: counts[train]], truth[train], faults[train], seconds)
             for train in range(trains)
         ]
 

@@ -147,7 +147,7 @@ def measure(point: Point) -> dict[str, Any]:
     row: dict[str, Any] = {}
     for result, _node in sil.run(loaded, calibration, runs=numbers, seed=point.seed):
         if result.run == numbers[-1]:
-            command_n = sil.commanded_force_n(result.frames, loaded.ticks)
+            command_n = sil.commanded_force_n(result.frames, len(result.truth))
             alpha = setup.error_weight(loaded, point.law)
             row = metrics.run_metrics(loaded, result.truth, command_n, alpha)
             row = {"run": result.run, **row, "faults": ", ".join(result.faults)}

@@ -110,8 +110,8 @@ class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     multiple: Quadruple = (-3.0, 1.0, -1.0, 2.0)  # centres, times the reference
     centre_m: Quadruple = (0.0, 0.0, 0.0, 0.0)  # and so much on top
     sigma_m: tuple[Length, Length, Length, Length] = (50.0, 30.0, 35.0, 40.0)
-    # Those of the speed memberships; none: the speed does not count.
-    sigma_m_s: tuple[Length, Length, Length, Length] | None = (50.0, 30.0, 35.0, 40.0)
+    # Those of the speed memberships; 0: the speed does not count.
+    sigma_m_s: tuple[NotNegative, NotNegative, NotNegative, NotNegative] = (50.0, 30.0, 35.0, 40.0)
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
@@ -136,7 +136,7 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
         params["inverse_sigma_1"][0, rule] = fixed(
             f"1 / sigma_m[{rule}]", 1 / gains.sigma_m[rule], 30
         )
-        if gains.sigma_m_s is not None:
+        if gains.sigma_m_s[rule]:
             params["inverse_sigma_2"][0, rule] = fixed(
                 f"1 / sigma_m_s[{rule}]", 1 / gains.sigma_m_s[rule], 30
             )

@@ -207,6 +207,22 @@ def test_the_faster_timetable_is_learned_too():
     assert largest(runs, "overspeed_km_h") <= 1.1
 
 
+FIXED_CENTRES = (
+    "[laws.afilc]\nmultiple = [0.0, 0.0, 0.0, 0.0]\n"
+    "centre_m = [6540.0, 19610.0, 32680.0, 45750.0]\n"
+    "sigma_m = [6540.0, 6540.0, 6540.0, 6540.0]\nsigma_m_s = [0.0, 0.0, 0.0, 0.0]\n"
+)
+
+
+@pytest.mark.long
+def test_rules_at_fixed_places_learn_no_better():
+    """Four along the track, indexed by time as the paper's are."""
+    paper, fixed = of(REV, IDEAL, count=20), of(REV, IDEAL + FIXED_CENTRES, count=20)
+    assert falls_to(fixed, POSITION) < 0.25
+    assert last_ten(fixed, SPEED) == pytest.approx(last_ten(paper, SPEED), rel=0.5)
+    assert last_ten(fixed, POSITION) > 0.9 * last_ten(paper, POSITION)
+
+
 # Long horizons: the lead of the memory has to match the lag of the actuators.
 
 

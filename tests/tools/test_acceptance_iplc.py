@@ -387,3 +387,19 @@ def test_feedback_of_the_current_run_mends_the_paper_s_law():
     rows = learn("gradient-paper:II", 30, **feedback)
     assert s(rows[30]) == pytest.approx(0.464, rel=0.05)
     assert v(rows[30]) == pytest.approx(0.0114, rel=0.05)
+
+
+@pytest.mark.long
+def test_the_p_type_baseline_learns_slowly():
+    """u_n = u_{n-1} + 0.002 e_v; its run 1 is the first, so its run n + 1 is our run n."""
+    loaded = load(PAPER)
+    rows = [
+        run_metrics(loaded, result.truth, result.truth["force_n"], None)
+        for result, _node in sil.run(
+            loaded, setup.calibration_for(loaded, "p-ilc"), runs=range(1, 12), seed=1
+        )
+    ]
+    assert s(rows[0]) == pytest.approx(21230, rel=1e-3)  # it stands
+    assert [v(rows[1]), v(rows[10])] == pytest.approx([26.9, 10.7], rel=0.01)
+    assert [s(rows[1]), s(rows[10])] == pytest.approx([13010, 794], rel=0.01)
+    assert s(rows[10]) > 100 * s(learn(PAPER, 10)[10])

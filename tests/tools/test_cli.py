@@ -120,6 +120,16 @@ def test_a_command_that_differs_ends_the_replay(recorded: Path, tmp_path: Path) 
     assert line.startswith("ato-hil: other.log: run 1, tick 10: FORCE_CMD.Tick is 10, recorded ")
 
 
+def test_the_profile_has_the_limit_that_follows_the_reference(tmp_path: Path) -> None:
+    done = ato_hil("profile", "crh3-learning", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) == 250_002
+    for line in lines[1::10_000]:
+        _tick, _position, speed, _acceleration, permitted = map(float, line.split(","))
+        assert permitted - speed == pytest.approx(2 / 3.6, abs=2e-7)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("paper", "least"), [("cailc", 20), ("drac", 15), ("afilc", 20), ("iplc", 25)]

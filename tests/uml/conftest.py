@@ -40,3 +40,18 @@ def node(runtime_dir: Path) -> Iterator[Callable[..., can.BusABC]]:
     yield open_node
     for bus in buses:
         bus.shutdown()
+
+
+@pytest.fixture
+def setting() -> Iterator[Callable[[str, str], None]]:
+    """Changes a setting of the kernel for one test."""
+    changed: dict[Path, str] = {}
+
+    def change(name: str, value: str) -> None:
+        path = Path("/proc/sys", name)
+        changed[path] = path.read_text()
+        path.write_text(value)
+
+    yield change
+    for path, value in changed.items():
+        path.write_text(value)

@@ -289,21 +289,6 @@ def test_an_impossible_name_of_an_interface(runtime_dir, channel):
     assert os.listdir(runtime_dir / "ato-hil") == []
 
 
-@pytest.fixture
-def setting():
-    """Changes a setting of the kernel for one test."""
-    changed = {}
-
-    def change(name: str, value: str) -> None:
-        path = Path("/proc/sys", name)
-        changed[path] = path.read_text()
-        path.write_text(value)
-
-    yield change
-    for path, value in changed.items():
-        path.write_text(value)
-
-
 def test_no_namespace_is_left(setting):
     setting("user/max_user_namespaces", "0")
     assert private_vcan_reason() == "no namespace is left (user.max_user_namespaces)"

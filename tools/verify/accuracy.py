@@ -122,7 +122,7 @@ def ideal_sensors(loaded: Loaded) -> Loaded:
 
 
 def reference_runs(law: str, reference: Reference, loaded: Loaded, runs: int) -> list[np.ndarray]:
-    """The leader's truth of each run with the float64 law in the loop."""
+    """The truth of the first train in each run with the float64 law in the loop."""
     numbers = setup.run_numbers(law, runs)
     truths = _runs(load_law(law), reference, loaded, law, numbers, drive=1)[1]
     return [truth[0] for truth in truths]

@@ -45,7 +45,7 @@ TRACK = {
     "multiple": (0.0, 0.0, 0.0, 0.0),
     "centre_m": (6540.0, 19610.0, 32680.0, 45750.0),
     "sigma_m": (6540.0,) * 4,
-    "sigma_m_s": None,
+    "sigma_m_s": (0.0,) * 4,
 }
 SETS = {"paper": PAPER, "default": DEFAULT, "track": DEFAULT | TRACK}
 UNITS = 2.0 ** np.array([q for _name, _unit, q in afilc.WORDS])
@@ -82,7 +82,7 @@ def exact(gains, inputs, before):
     multiple = np.array(gains.multiple)
     centre_1 = multiple * p1[:, None] + np.array(gains.centre_m)
     g = (s[:, None] - centre_1) ** 2 / (2 * np.array(gains.sigma_m) ** 2)
-    if gains.sigma_m_s is not None:
+    if any(gains.sigma_m_s):
         g += (v[:, None] - multiple * p2[:, None]) ** 2 / (2 * np.array(gains.sigma_m_s) ** 2)
     mu = np.exp(g.min(axis=1)[:, None] - g)
     delta = mu / mu.sum(axis=1)[:, None]
@@ -238,6 +238,7 @@ def test_words_start_at_zero_within_their_bounds():
         ({"Gamma": (0.0, 0.0, 1e-4)}, "64^4 Gamma[2]: 1677.72 is outside .*, +-512"),
         ({"kv": 1e-5}, "1 / kv: 100000 is outside .*, +-32768"),
         ({"c": (0.0, 1e-3)}, "64^2 c: 4.096 is outside .*, +-2"),
+        ({"sigma_m_s": (0.1,) * 4}, "1 / sigma_m_s[0]: 10 is outside .*, +-2"),
         ({"eps": 1e-5}, "1 / eps: 100000 is outside .*, +-32768"),
     ],
 )

@@ -7,7 +7,7 @@ from tools.verify.references import afilc, cailc, drac, iplc, mtcc
 REFERENCES: dict[str, Reference] = {
     **cailc.REFERENCES,
     **drac.REFERENCES,
+    **mtcc.REFERENCES,
     **afilc.REFERENCES,
     **iplc.REFERENCES,
-    **mtcc.REFERENCES,
 }

@@ -48,7 +48,7 @@ def params(gains: Any, vehicle: Vehicle) -> np.ndarray:
     bounds = (gains.a, gains.b, gains.c, *[gains.w] * afilc.RULES, (0.0, gains.rho_max))
     values["low"], values["high"] = zip(*bounds, strict=True)
     values["centre"], values["sigma_1"] = gains.centre_m, gains.sigma_m
-    values["sigma_2"] = math.inf if gains.sigma_m_s is None else gains.sigma_m_s
+    values["sigma_2"] = [sigma or math.inf for sigma in gains.sigma_m_s]
     values["force_max"] = vehicle.force_max_m_s2
     return values
 
