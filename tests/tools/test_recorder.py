@@ -562,7 +562,7 @@ def test_a_run_of_a_line_has_ended_when_it_has_on_every_bus(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     line = RunsOfLine(2)
-    event = {"ticks": 10, "frames": 40, "lost": {}, "complete": True}
+    event = {"ticks": 10, "frames": 40, "lost": {}, "dropped": 1, "foreign": 0, "complete": True}
     line.ended(1, {"run": 1, "digest": "b1", **event})
     line.ended(1, {"run": 2, "digest": "b2", **event, "lost": {"TRAIN_SPEED": 3}})
     assert capsys.readouterr().out == ""
@@ -570,7 +570,7 @@ def test_a_run_of_a_line_has_ended_when_it_has_on_every_bus(
     line.ended(0, {"run": 2, "digest": "a2", **event, "ticks": 9, "complete": False})
     first, second = map(json.loads, capsys.readouterr().out.splitlines())
     assert (first["run"], first["digests"], first["complete"]) == (1, ["a1", "b1"], True)
-    assert first["frames"] == 80
+    assert (first["frames"], first["dropped"]) == (80, 2)
     assert (second["run"], second["digests"], second["complete"]) == (2, ["a2", "b2"], False)
     assert second["ticks"] == 9
     assert second["lost"] == {"TRAIN_SPEED of train 2": 3}
