@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,6 +16,21 @@ from can_dbc import hub_server
 hypothesis.settings.register_profile("local", deadline=None, print_blob=True)
 hypothesis.settings.register_profile("ci", deadline=None, print_blob=True, derandomize=True)
 hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "local")
+
+
+STARTED = time.monotonic()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """--budget-minutes: how long to go on starting tests."""
+    parser.addoption("--budget-minutes", type=float, default=float("inf"))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A test that would start after the budget is skipped, and says so."""
+    minutes = item.config.getoption("--budget-minutes")
+    if time.monotonic() - STARTED > 60 * minutes:
+        pytest.skip(f"not started: the budget of {minutes:g} minutes is used up")
 
 
 @pytest.fixture(autouse=True)
