@@ -1,6 +1,7 @@
 """Settings of the whole suite."""
 
 import os
+import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +20,9 @@ hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "local")
 
 
 STARTED = time.monotonic()
+
+# A shell that starts the tests in the background has every process below it ignore Ctrl-C.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -569,7 +569,7 @@ def _sweep(
 
 @app.command()
 def claims(
-    paper: Annotated[str, typer.Argument(help="The paper, by its law: cailc, drac, iplc.")],
+    paper: Annotated[str, typer.Argument(help="Of which law: cailc, drac, mtcc, afilc, iplc.")],
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the rows to this file as well.")
     ] = None,

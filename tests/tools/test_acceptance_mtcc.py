@@ -89,6 +89,7 @@ def test_every_train_comes_back_from_two_metres() -> None:
     text = SENSORS + actuator(0, 0.4) + NO_REBASING + "[train]\nstart_m = 2.0\n"
     far = run("line", text)
     assert far.largest_error_m.min() > 1.9
+    assert far.minute_error_m <= 0.050
     assert far.late_error_m <= 0.075  # what lag 0.4 has without the start
     assert "timetable re-based" not in far.faults
 

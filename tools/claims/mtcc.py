@@ -81,6 +81,7 @@ class Run:
     least_error_m: np.ndarray
     largest_error_m: np.ndarray
     last_error_m: np.ndarray
+    minute_error_m: float  # largest of a train after 60 s
     late_error_m: float  # largest from 60 s on
     outside_at_s: float  # when the first train leaves its barrier of 0.2 m, inf: never
     peak_force_m_s2: float  # of the actuators
@@ -118,6 +119,7 @@ def run(base: str, text: str = "", law: str | None = None, seed: int = 1) -> Run
         least_error_m=error.min(axis=1),
         largest_error_m=error.max(axis=1),
         last_error_m=error[:, -1],
+        minute_error_m=float(np.abs(error[:, round(60 / period_s)]).max()),
         late_error_m=float(np.abs(error[:, round(60 / period_s) :]).max()),
         outside_at_s=float(outside[0]) * period_s if len(outside) else inf,
         peak_force_m_s2=float(force.max()),
