@@ -103,7 +103,7 @@ def test_only_the_default_gains_keep_both_guarantees(name, slack_m_s2, bound_km_
 # What early runs leave alone.
 
 
-@pytest.mark.parametrize("decimation", [1, 16])
+@pytest.mark.parametrize("decimation", [pytest.param(1, marks=pytest.mark.long), 16])
 def test_ticks_that_a_run_does_not_reach_keep_what_they_have(decimation):
     """To the bit, in every word; the open cell takes the mean of the ticks that it had."""
     loaded = variant(REV, IDEAL + grid(0, decimation))

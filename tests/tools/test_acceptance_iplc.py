@@ -88,6 +88,7 @@ def contraction(rows):
 # What a few runs show.
 
 
+@pytest.mark.long
 def test_the_paper_s_second_case_run_by_run():
     """The train creeps off in run 1 and is not there by run 3; figures of the restored law."""
     rows = learn("gradient-paper:II", 3)

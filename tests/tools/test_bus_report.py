@@ -36,6 +36,7 @@ def sent_message(name: str, frame_id: int, sender: str, **more: float) -> Traffi
     return Traffic(name, frame_id, 8, sender, values["frames_per_tick"], int(values["cycle_ticks"]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scenario", "law", "more"),
     [
