@@ -159,7 +159,7 @@ def check_frames() -> Iterator[Row]:
 
 
 def _definitions() -> list[str]:
-    """What the C twins take from the DBC and from controller/q.py."""
+    """What the C twins take from the DBC, controller/q.py and the records."""
     places = {
         "SPEED": TRAIN_SPEED.Speed,
         "QUALITY": TRAIN_SPEED.Quality,
@@ -168,6 +168,9 @@ def _definitions() -> list[str]:
         "TICK": FORCE_CMD.Tick,
     }
     defined = [f"-DSIN_{n}={getattr(q, f'_SIN_{n}')}" for n in (1, 3, 5, 7)]
+    defined += [f"-DWORDS_MAX={memory.WORDS_MAX}", f"-DAHEAD_WORDS={memory.AHEAD_WORDS}"]
+    for record, dtype in (("CELL", CELL), ("INPUTS", INPUTS), ("OUTPUTS", OUTPUTS)):
+        defined.append(f"-D{record}_BYTES={dtype.itemsize}")
     for name, signal in places.items():
         defined += [
             f"-D{name}_START={signal.start}",

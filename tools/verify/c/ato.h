@@ -20,8 +20,10 @@ static inline int64_t floor_div(int64_t a, int64_t b)
 }
 
 struct cell {
-	int32_t before[8];
-	int32_t learn[8];
+	int32_t before[WORDS_MAX];
+	int32_t learn[WORDS_MAX];
+	int32_t ahead[AHEAD_WORDS];
+	int32_t smooth, padding;
 };
 
 struct inputs {
@@ -29,12 +31,18 @@ struct inputs {
 	int32_t position, speed;
 	int32_t reference_position, reference_speed, reference_acceleration;
 	int32_t ahead_position, ahead_speed, ahead_acceleration;
-	int32_t limited, padding;
+	int32_t limited, map_acceleration;
+	int32_t neighbour[2], distance[2], closing[2];
 };
 
 struct outputs {
 	int32_t force, status;
 	int32_t estimate[10];
 };
+
+/* The records of controller/interface.py and controller/memory.py, in their sizes. */
+_Static_assert(sizeof(struct cell) == CELL_BYTES, "struct cell");
+_Static_assert(sizeof(struct inputs) == INPUTS_BYTES, "struct inputs");
+_Static_assert(sizeof(struct outputs) == OUTPUTS_BYTES, "struct outputs");
 
 #endif
