@@ -82,6 +82,15 @@ def next_counter(counter: Any) -> Any:
 
 
 @step
+def send(node: Any, tx: Any, message: Any, word: Any) -> None:
+    """Protects `word` and puts it into the message's mailbox; `node.sent` has the counters."""
+    counter = int64(node.sent[message.index])
+    node.sent[message.index] = next_counter(counter)
+    tx[message.index].payload = protect(word, counter, message.data_id)
+    tx[message.index].fresh = 1
+
+
+@step
 def check(word: Any, last_counter: Any, data_id: Any) -> Any:
     """OK, REPEATED, LOST or CORRUPT; `last_counter` is that of the last good frame, -1 if there
     was none."""

@@ -32,6 +32,7 @@ import socket
 import struct
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 PROTOCOL = 1
@@ -99,13 +100,21 @@ def main() -> None:
         identity = os.stat(path)
     except OSError as error:
         sys.exit(f"hub_server: standard input must be the socket that listens on {path}: {error}")
+    serve_as_daemon(path, identity, lambda: serve(listener))
+
+
+def serve_as_daemon(path: str, identity: os.stat_result, serve: Callable[[], None]) -> None:
+    """Become a daemon, serve until `serve` returns or SIGTERM, then delete the socket at `path`.
+
+    :param identity: of the socket when the server was elected.
+    """
     become_daemon()
     signal.signal(signal.SIGTERM, lambda signum, frame: sys.exit(0))
     try:
-        serve(listener)
+        serve()
     finally:
-        # Who has connected by now is disconnected when this process ends, and elects the next hub.
-        # A hub whose file was deleted must not delete that of the hub elected since.
+        # Who has connected by now is disconnected when this process ends, and elects the next
+        # server. One whose file was deleted must not delete that of the server elected since.
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.stat(path), identity):
                 os.unlink(path)

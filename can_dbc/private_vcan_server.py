@@ -1,6 +1,6 @@
 """The process that keeps a private vcan: a network namespace with one vcan interface in it.
 
-Started by the first node of a channel (`can_dbc.private_vcan`), which hands over the listening
+Started by the first node of a channel (`can_dbc.socketcan`), which hands over the listening
 socket as standard input: `python private_vcan_server.py SOCKETPATH`. The interface is called what
 stands before the `+` in the socket's name. It needs nothing but the standard library and no
 privileges: a user namespace of its own gives it the right to a network namespace, and netlink makes
@@ -17,7 +17,6 @@ import ctypes
 import errno
 import os
 import selectors
-import signal
 import socket
 import struct
 import sys
@@ -64,7 +63,7 @@ class NoVcanError(Exception):
 
 def main() -> None:
     """Make the network, become a daemon, then hand out sockets until all nodes have left."""
-    from can_dbc.hub_server import become_daemon
+    from can_dbc.hub_server import serve_as_daemon
 
     if len(sys.argv) == 1:
         try:
@@ -81,15 +80,7 @@ def main() -> None:
         sys.exit(f"standard input must be the socket that listens on {path}: {error}")
     except NoVcanError as error:
         sys.exit(str(error))
-    become_daemon()
-    signal.signal(signal.SIGTERM, lambda signum, frame: sys.exit(0))
-    try:
-        serve(listener)
-    finally:
-        # A server whose file was deleted must not delete that of the server elected since.
-        with contextlib.suppress(FileNotFoundError):
-            if os.path.samestat(os.stat(path), identity):
-                os.unlink(path)
+    serve_as_daemon(path, identity, lambda: serve(listener))
 
 
 def make_network(name: str) -> None:

@@ -192,15 +192,6 @@ def receive(link: Any, mailbox: Any, data_id: Any) -> Any:
 
 
 @step
-def send(core: Any, tx: Any, message: Any, word: Any) -> None:
-    """Protects `word` and puts it into the message's mailbox."""
-    counter = int64(core.sent[message.index])
-    core.sent[message.index] = e2e.next_counter(counter)
-    tx[message.index].payload = e2e.protect(word, counter, message.data_id)
-    tx[message.index].fresh = 1
-
-
-@step
 def begin(params: Any, profile: Any, state: Any, cells: Any) -> None:
     """State of a new run: reference at its start, counters at 0, no fault; the learning memory
     stays."""
@@ -361,7 +352,7 @@ def read_map(params: Any, state: Any) -> None:
 def car_words(core: Any, tx: Any, cars: Any) -> None:
     """CAR_FORCE_1 to CAR_FORCE_4, two cars a frame, as many as there are cars."""
     if cars > 0:
-        send(
+        e2e.send(
             core,
             tx,
             CAR_FORCE_1,
@@ -369,7 +360,7 @@ def car_words(core: Any, tx: Any, cars: Any) -> None:
             + put(CAR_FORCE_1.Car2, saturate(CAR_FORCE_1.Car2, int64(core.car_force[1]))),
         )
     if cars > 2:
-        send(
+        e2e.send(
             core,
             tx,
             CAR_FORCE_2,
@@ -377,7 +368,7 @@ def car_words(core: Any, tx: Any, cars: Any) -> None:
             + put(CAR_FORCE_2.Car4, saturate(CAR_FORCE_2.Car4, int64(core.car_force[3]))),
         )
     if cars > 4:
-        send(
+        e2e.send(
             core,
             tx,
             CAR_FORCE_3,
@@ -385,7 +376,7 @@ def car_words(core: Any, tx: Any, cars: Any) -> None:
             + put(CAR_FORCE_3.Car6, saturate(CAR_FORCE_3.Car6, int64(core.car_force[5]))),
         )
     if cars > 6:
-        send(
+        e2e.send(
             core,
             tx,
             CAR_FORCE_4,
@@ -460,10 +451,10 @@ def build_tick(law_step: Any) -> Any:
         car_words(core, tx, int64(params.distribution.cars))
         phase = tick % STATUS_PERIOD
         if phase == 0:
-            send(core, tx, ATO_STATUS, status_word(params, core))
-            send(core, tx, ATO_TRACKING, tracking_word(inputs))
+            e2e.send(core, tx, ATO_STATUS, status_word(params, core))
+            e2e.send(core, tx, ATO_TRACKING, tracking_word(inputs))
         if phase < int64(params.core.estimates):
-            send(
+            e2e.send(
                 core,
                 tx,
                 ATO_ESTIMATE,
@@ -474,13 +465,13 @@ def build_tick(law_step: Any) -> Any:
                 ),
             )
         if has_neighbours and phase == 0:
-            send(core, tx, ATO_RADIO, radio_word(state))
+            e2e.send(core, tx, ATO_RADIO, radio_word(state))
         mode = int64(COAST)
         if force > 0:
             mode = int64(TRACTION)
         if force < 0:
             mode = int64(BRAKE)
-        send(
+        e2e.send(
             core,
             tx,
             FORCE_CMD,
@@ -512,7 +503,7 @@ def build_tick(law_step: Any) -> Any:
                 core.iteration = get(word, RUN_CTRL.Iteration)
                 if wanted == ARMED:
                     begin(params, profile, state, cells)
-                send(core, tx, ATO_STATUS, status_word(params, core))
+                e2e.send(core, tx, ATO_STATUS, status_word(params, core))
         if int64(core.run_state) == RUNNING and period == 1:
             read_inputs(state, rx)
             run_tick(params, profile, state, cells, rx, tx)

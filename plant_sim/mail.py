@@ -1,4 +1,4 @@
-"""Protected frames in and out of the mailboxes of a plant node."""
+"""Protected frames out of the mailboxes of a plant node."""
 
 from __future__ import annotations
 
@@ -6,15 +6,6 @@ from typing import Any
 
 from can_dbc import e2e
 from can_dbc.step import int64, step
-
-
-@step
-def send(node: Any, tx: Any, message: Any, word: Any) -> None:
-    """Protects `word` and puts it into the message's mailbox."""
-    counter = int64(node.sent[message.index])
-    node.sent[message.index] = e2e.next_counter(counter)
-    tx[message.index].payload = e2e.protect(word, counter, message.data_id)
-    tx[message.index].fresh = 1
 
 
 @step

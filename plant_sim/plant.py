@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from can_dbc import e2e
 from can_dbc.codec import (
     ATO_STATUS,
     ATP_LIMIT,
@@ -31,7 +32,7 @@ from can_dbc.codec import (
 )
 from can_dbc.step import int64, step
 from plant_sim import actuator, radio
-from plant_sim.mail import received, send
+from plant_sim.mail import received
 
 IDLE, ARMED, RUNNING, ENDED = 0, 1, 2, 3
 CONTROL_PERIOD_TICKS = 10  # RUN_CTRL comes every so many ticks
@@ -158,7 +159,7 @@ def announce(node: Any, run_state: Any, iteration: Any, tx: Any) -> None:
             node.received[i] = -1
     node.run_state = run_state
     node.iteration = iteration
-    send(node, tx, RUN_CTRL, control_word(node))
+    e2e.send(node, tx, RUN_CTRL, control_word(node))
 
 
 @step
@@ -284,9 +285,9 @@ def build(model: Any) -> tuple[Any, Any, Any]:
             node.limit += 1
         node.permitted_speed_m_s = limits[int64(node.limit)].speed_m_s
         if tick % CONTROL_PERIOD_TICKS == 0:
-            send(node, tx, RUN_CTRL, control_word(node))
+            e2e.send(node, tx, RUN_CTRL, control_word(node))
         permitted = raw_of(ATP_LIMIT.PermittedSpeed, node.permitted_speed_m_s)
-        send(
+        e2e.send(
             node,
             tx,
             ATP_LIMIT,
@@ -303,7 +304,7 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         speed += setting.speed_noise_m_s * chance.speed_noise
         position = quantised(position, setting.position_step_m)
         speed = quantised(speed, setting.speed_step_m_s)
-        send(
+        e2e.send(
             node,
             tx,
             TRAIN_SPEED,
@@ -312,7 +313,7 @@ def build(model: Any) -> tuple[Any, Any, Any]:
                 TRAIN_SPEED.Acceleration, raw_of(TRAIN_SPEED.Acceleration, train.acceleration_m_s2)
             ),
         )
-        send(
+        e2e.send(
             node,
             tx,
             TRAIN_POSITION,

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from can_dbc import e2e
 from can_dbc.codec import (
     ATO_RADIO,
     NEIGHBOUR_AHEAD_MOTION,
@@ -27,7 +28,7 @@ from can_dbc.codec import (
 )
 from can_dbc.step import dbc_path, int64, step
 from plant_sim.line import PACKETS_MAX
-from plant_sim.mail import received, send
+from plant_sim.mail import received
 
 REPEAT_TICKS = 10
 AHEAD, BEHIND = 0, 1
@@ -143,12 +144,12 @@ def pass_on(
     state.due[side] = tick + REPEAT_TICKS
     packet = state.heard[side]
     if packet.stamp < 0:
-        send(node, tx, place, int64(0))
-        send(node, tx, motion, int64(0))
+        e2e.send(node, tx, place, int64(0))
+        e2e.send(node, tx, motion, int64(0))
         return
     brakes = packet.brake_to_rear if side == AHEAD else packet.brake_to_front
     age = int64(np.floor((tick - packet.stamp) * params.age_factor + 0.5))
-    send(
+    e2e.send(
         node,
         tx,
         place,
@@ -158,7 +159,7 @@ def pass_on(
         + put(place.EmergencyBrake, int64(brakes))
         + put(place.Rebased, int64(packet.rebased)),
     )
-    send(
+    e2e.send(
         node,
         tx,
         motion,

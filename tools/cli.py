@@ -465,7 +465,7 @@ def compare(
     with one_line_for_bad_input():
         from plant_sim.scenario import load
         from tools import compare as side_by_side
-        from tools import session
+        from tools import files, session
 
         loaded = load(scenario)
         folder = out or Path("runs") / f"{loaded.folder_name}-compare"
@@ -480,7 +480,7 @@ def compare(
                 folder / "trace.rrd",
                 lambda law: status.update(f"{law} ..."),
             )
-        session.write_json(
+        files.write_json(
             folder / "compare.json", {"schema": 1, "scenario": loaded.name, "rows": rows}
         )
     table = Table("law", *(name for name, key, _f, _s in COMPARED), "faults", header_style="bold")
@@ -531,7 +531,7 @@ def _sweep(
     scenario: str, vary: list[str], law: str | None, runs: int | None, seed: int, out: Path | None
 ) -> None:
     from plant_sim.scenario import load
-    from tools import session
+    from tools import files, session
     from tools import sweep as side_by_side
 
     points = side_by_side.plan(scenario, law, vary, runs, seed)
@@ -546,7 +546,7 @@ def _sweep(
             status.update(f"{len(done)} of {len(points)} combinations")
     rows = [done[index] for index in range(len(points))]
     side_by_side.write_table(folder / "sweep.csv", rows)
-    session.write_json(
+    files.write_json(
         folder / "sweep.json",
         {"schema": 1, "scenario": loaded.name, "law": points[0].law, "vary": keys, "rows": rows},
     )
@@ -576,10 +576,10 @@ def claims(
 ) -> None:
     """Measure a paper's claims through the product, row by row."""
     import importlib
-    import json
     import pkgutil
 
     from tools import claims as papers
+    from tools import files
     from tools.claims.table import evaluate
 
     known = sorted({module.name for module in pkgutil.iter_modules(papers.__path__)} - {"table"})
@@ -604,7 +604,7 @@ def claims(
     console.print(table)
     if json_file is not None:
         content = {"schema": 1, "paper": paper, "claims": [row.as_json() for row in rows]}
-        json_file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        files.write_json(json_file, content)
     surprises = [row.text for row in rows if row.holds != row.expected]
     if surprises:
         raise _fail(f"otherwise than found before: {'; '.join(surprises)}", EXIT_BAD_INPUT)

@@ -47,8 +47,7 @@ def compare(
                 run = results[0].run
                 if run not in (1, numbers[-1]):
                     continue
-                frames, truths = [r.frames for r in results], [r.truth for r in results]
-                row = line.run_row(trains, law, frames, truths)
+                row = line.row_of(trains, law, results)
                 faults = sorted({name for result in results for name in result.faults})
                 rows.append({"law": law, "run": run, **row, "faults": faults})
                 if run == numbers[-1]:

@@ -115,13 +115,17 @@ def decode(frames: np.ndarray, message: Any, signal: str) -> tuple[np.ndarray, n
 
 
 def held(frames: np.ndarray, ticks: int, message: Any, signal: str) -> np.ndarray:
-    """Physical values (float64) of one signal in ticks 0 to `ticks` - 1; a tick without the frame
-    repeats the last, and is 0 before the first."""
-    at, values = decode(frames, message, signal)
-    at, values = at[at < ticks], values[at < ticks]
-    row = np.zeros(ticks, np.int64)
-    row[at] = np.arange(1, len(at) + 1)
-    return np.concatenate(([0.0], values))[np.maximum.accumulate(row)]
+    """Physical values (float64) of one signal in ticks 0 to `ticks` - 1, as `held_values`."""
+    return held_values(*decode(frames, message, signal), ticks)
+
+
+def held_values(at: np.ndarray, values: np.ndarray, ticks: int) -> np.ndarray:
+    """Of values sent at the rising ticks `at`, the last in each of ticks 0 to `ticks` - 1: before
+    the first one, the first; all 0 if there is none."""
+    if not len(at):
+        return np.zeros(ticks)
+    latest = np.searchsorted(at, np.arange(ticks), side="right") - 1
+    return np.asarray(values[np.maximum(latest, 0)])
 
 
 def physical(words: np.ndarray, message: Any, signal: str) -> np.ndarray:

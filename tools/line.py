@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from can_dbc.codec import ATO_TRACKING
+from controller.registry import law_label
 from plant_sim.scenario import Loaded
 from tools import metrics
-from tools.frames import decode
+from tools.frames import decode, held_values
 from tools.setup import error_weight
-from tools.sil import commanded_force_n
+from tools.sil import RunResult, commanded_force_n
 
 
 def run_row(
@@ -42,6 +43,12 @@ def run_row(
     return worst
 
 
+def row_of(members: list[Loaded], law: str, results: list[RunResult]) -> dict[str, Any]:
+    """`run_row` of a run in one process, with a result for each train."""
+    frames, truths = [result.frames for result in results], [result.truth for result in results]
+    return run_row(members, law, frames, truths)
+
+
 def _worst(key: str, values: list[Any]) -> Any:
     """What stands for the values of all trains."""
     known = [value for value in values if value is not None]
@@ -69,9 +76,9 @@ def line_columns(
     for train, (member, sent, truth) in enumerate(zip(members, frames, truths, strict=True)):
         if train > 0:
             columns["separation_m"][train] = truths[train - 1]["position_m"] - truth["position_m"]
-        bound = member.scenario.laws[law].get("k")
-        at, error = decode(sent[sent["tick"] < ticks], ATO_TRACKING, "PositionError")
+        bound = member.scenario.laws.get(law_label(law), {}).get("k")
+        at, error = decode(sent, ATO_TRACKING, "PositionError")
         if bound is not None and len(at):
-            latest = np.searchsorted(at, np.arange(ticks), side="right") - 1
-            columns["barrier_distance_m"][train] = bound - np.abs(error)[np.maximum(latest, 0)]
+            error = held_values(at, error, ticks)
+            columns["barrier_distance_m"][train] = bound - np.abs(error)
     return columns

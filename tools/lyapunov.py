@@ -17,7 +17,7 @@ from controller.laws import drac
 from controller.registry import law_label, load_law
 from plant_sim.scenario import Loaded
 from plant_sim.trains import point
-from tools.frames import estimate
+from tools.frames import estimate, held_values
 
 # As the plant's truth: one float64 column.
 LYAPUNOV = np.dtype([("lyapunov", np.float64)])
@@ -38,7 +38,7 @@ def lyapunov(loaded: Loaded, law: str, frames: np.ndarray, truth: np.ndarray) ->
         scenario.laws.get(law_label(law), {}), load_law(law).Gains, strict=False
     )
     ticks = len(truth)
-    held = np.column_stack([_held(*estimate(frames, index), ticks) for index in range(4)])
+    held = np.column_stack([held_values(*estimate(frames, index), ticks) for index in range(4)])
 
     span = np.array([drac.si(i, gains.theta_span[i]) for i in range(3)])
     estimated = held[:, 1:] * [drac.si(i, 1.0) for i in range(3)]
@@ -56,12 +56,6 @@ def lyapunov(loaded: Loaded, law: str, frames: np.ndarray, truth: np.ndarray) ->
         + (eta**2 / (2 * np.array(rate))).sum(axis=1)
     )
     return table
-
-
-def _held(at: np.ndarray, values: np.ndarray, ticks: int) -> np.ndarray:
-    """The last value at each tick; before the first one, the first."""
-    latest = np.searchsorted(at, np.arange(ticks), side="right") - 1
-    return np.asarray(values[np.maximum(latest, 0)])
 
 
 def _true_theta(train: point.Train, ticks: int, period_s: float) -> np.ndarray:

@@ -7,8 +7,6 @@ plant or controller, or both, may be external: started by their owner, known by 
 
 from __future__ import annotations
 
-import json
-import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -25,6 +23,7 @@ from controller.interface import fault_names
 from controller.registry import is_file, load_law
 from plant_sim.scenario import FOLDER, Loaded, load, members
 from tools import hil, line, record, setup, sil
+from tools.files import write_json
 from tools.frames import LineDigest
 from tools.hil import RunError
 from tools.lyapunov import has_lyapunov, lyapunov
@@ -173,13 +172,6 @@ def prepare(out: Path) -> None:
             (out / name).unlink(missing_ok=True)
     except OSError as error:
         raise SessionError(f"{out}: cannot write there: {error.strerror}") from None
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes a JSON file whole or not at all."""
-    temporary = path.with_suffix(".new")
-    temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ row beats in both.
 from __future__ import annotations
 
 import csv
+import io
 import itertools
 import multiprocessing
 import os
@@ -21,8 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from controller.registry import law_label
-from plant_sim.scenario import Loaded, load, overlaid
-from tools import metrics, setup, sil
+from plant_sim.scenario import Loaded, load, members, overlaid
+from tools import line, setup, sil
+from tools.files import write_text
 
 CASE = "case"  # the key that varies the scenario's named case
 LAW = "law."  # short for laws.<the law>.
@@ -134,23 +136,24 @@ def _compile(points: list[Point]) -> None:
         what = (point.law, type(loaded.scenario.train))
         if what not in seen:
             seen.add(what)
-            calibration = setup.calibration_for(loaded, point.law)
-            for _result in sil.run(loaded, calibration, runs=range(0), seed=point.seed):
+            nodes = setup.controllers_for(members(loaded), point.law)
+            for _results in sil.run_line(loaded, nodes, runs=range(0), seed=point.seed):
                 pass
 
 
 def measure(point: Point) -> dict[str, Any]:
-    """The row of one point: its values, and the metrics of its last run."""
+    """The row of one point: its values, and the metrics of its last run, of a line the worst."""
     loaded = overlaid(point.scenario, point.overlay)
+    trains = members(loaded)
+    nodes = setup.controllers_for(trains, point.law)
     numbers = setup.run_numbers(point.law, point.runs)
-    calibration = setup.calibration_for(loaded, point.law)
     row: dict[str, Any] = {}
-    for result, _node in sil.run(loaded, calibration, runs=numbers, seed=point.seed):
-        if result.run == numbers[-1]:
-            command_n = sil.commanded_force_n(result.frames, len(result.truth))
-            alpha = setup.error_weight(loaded, point.law)
-            row = metrics.run_metrics(loaded, result.truth, command_n, alpha)
-            row = {"run": result.run, **row, "faults": ", ".join(result.faults)}
+    for results in sil.run_line(loaded, nodes, runs=numbers, seed=point.seed):
+        if results[0].run == numbers[-1]:
+            row = {"run": numbers[-1], **line.row_of(trains, point.law, results)}
+            faults = (name for result in results for name in result.faults)
+            row["faults"] = ", ".join(dict.fromkeys(faults))
+    row.pop("trains", None)
     return {**{key: _plain(value) for key, value in point.values.items()}, **row}
 
 
@@ -170,12 +173,11 @@ def pareto(rows: list[dict[str, Any]]) -> list[int]:
 
 def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
     """The rows as CSV, whole or not at all."""
-    temporary = path.with_suffix(".new")
-    with open(temporary, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    os.replace(temporary, path)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
 
 
 def label(row: dict[str, Any], keys: list[str]) -> str:
@@ -206,12 +208,12 @@ def plot(path: Path, loaded: Loaded, rows: list[dict[str, Any]], keys: list[str]
     series: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         series.setdefault(label(row, keys[:-1]), []).append(row)
-    for (name, members), (offset, side) in zip(
+    for (name, of_series), (offset, side) in zip(
         series.items(), itertools.cycle(LABELS), strict=False
     ):
-        energy, error = ([row[key] for row in members] for key in (ENERGY, ERROR))
+        energy, error = ([row[key] for row in of_series] for key in (ENERGY, ERROR))
         axes.scatter(energy, error, s=30, zorder=2, label=name)
-        for row in members:
+        for row in of_series:
             axes.annotate(
                 label(row, keys[-1:]),
                 (row[ENERGY], row[ERROR]),

@@ -1,7 +1,11 @@
-"""A short session and its recording."""
+"""The command, a short session and its recording."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +36,30 @@ class Silent:
     def note(self, text: str) -> None: ...
     def progress(self, run: int, tick: int) -> None: ...
     def row(self, row: dict[str, Any]) -> None: ...
+
+
+@pytest.fixture(scope="session")
+def short_text() -> str:
+    """A scenario of 2001 ticks and two runs, as TOML."""
+    return SHORT
+
+
+@pytest.fixture(scope="session")
+def ato_hil() -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs the command with these arguments in the folder `cwd`."""
+
+    def run(*arguments: str, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "tools.cli", *arguments],
+            cwd=cwd,
+            env={**os.environ, **environment},
+            capture_output=True,
+            text=True,
+            timeout=900,
+            check=False,
+        )
+
+    return run
 
 
 @pytest.fixture(scope="session")

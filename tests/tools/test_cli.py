@@ -4,49 +4,21 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from plant_sim.scenario import scenario_names
 
-SHORT = """
-base = "subway-fast"
-title = "A short run between two stops"
-runs = 2
 
-[profile]
-duration_s = 20.0
-distance_m = 45.0
-max_speed_m_s = 5.0
-ramps = [
-    { to_m_s = "solved", start_s = 1.0, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 },
-    { to_m_s = 0.0, end_s = 18.0, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 },
-]
-"""
-
-
-def ato_hil(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tools.cli", *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=900,
-        check=False,
-    )
-
-
-def test_list_names_every_scenario(tmp_path: Path) -> None:
+def test_list_names_every_scenario(ato_hil, tmp_path: Path) -> None:
     done = ato_hil("list", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for name in scenario_names():
         assert name in done.stdout
 
 
-def test_doctor_finds_this_machine_fit(tmp_path: Path) -> None:
+def test_doctor_finds_this_machine_fit(ato_hil, tmp_path: Path) -> None:
     done = ato_hil("doctor", cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     for what in ("compiler", "compiler cache", "DBC", "bus hub", "bus socketcan:vcan0", "viewer"):
@@ -54,8 +26,8 @@ def test_doctor_finds_this_machine_fit(tmp_path: Path) -> None:
     assert "broken" not in done.stdout
 
 
-def test_compare_lays_laws_side_by_side(tmp_path: Path) -> None:
-    (tmp_path / "short.toml").write_text(SHORT)
+def test_compare_lays_laws_side_by_side(ato_hil, short_text, tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text(short_text)
     done = ato_hil("compare", "short.toml", "--laws", "cailc,pid", "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "out" / "compare.json").read_text())["rows"]
@@ -87,14 +59,16 @@ def test_compare_lays_laws_side_by_side(tmp_path: Path) -> None:
         (["decode", "none.log", "--out", "x.csv"], "none.log: cannot be read: No such file"),
     ],
 )
-def test_bad_input_is_one_clear_line(tmp_path: Path, arguments: list[str], says: str) -> None:
+def test_bad_input_is_one_clear_line(
+    ato_hil, tmp_path: Path, arguments: list[str], says: str
+) -> None:
     done = ato_hil(*arguments, cwd=tmp_path)
     assert done.returncode == 1
     assert says in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_a_recording_is_replayed_and_decoded(recorded: Path, tmp_path: Path) -> None:
+def test_a_recording_is_replayed_and_decoded(ato_hil, recorded: Path, tmp_path: Path) -> None:
     done = ato_hil("replay", str(recorded), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
@@ -108,7 +82,7 @@ def test_a_recording_is_replayed_and_decoded(recorded: Path, tmp_path: Path) -> 
     assert done.stdout == f"table.csv: {frames} frames, 8 messages\n"
 
 
-def test_a_command_that_differs_ends_the_replay(recorded: Path, tmp_path: Path) -> None:
+def test_a_command_that_differs_ends_the_replay(ato_hil, recorded: Path, tmp_path: Path) -> None:
     lines = recorded.read_text().splitlines(keepends=True)
     (at, *_) = [i for i, line in enumerate(lines) if "(0.100000) can0 0C0#" in line]
     lines[at] = lines[at][:-4] + "1 R\n"
@@ -120,7 +94,7 @@ def test_a_command_that_differs_ends_the_replay(recorded: Path, tmp_path: Path) 
     assert line.startswith("ato-hil: other.log: run 1, tick 10: FORCE_CMD.Tick is 10, recorded ")
 
 
-def test_the_profile_has_the_limit_that_follows_the_reference(tmp_path: Path) -> None:
+def test_the_profile_has_the_limit_that_follows_the_reference(ato_hil, tmp_path: Path) -> None:
     done = ato_hil("profile", "crh3-learning", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
@@ -132,9 +106,11 @@ def test_the_profile_has_the_limit_that_follows_the_reference(tmp_path: Path) ->
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("paper", "least"), [("cailc", 20), ("drac", 15), ("afilc", 20), ("iplc", 25)]
+    ("paper", "least"), [("cailc", 20), ("drac", 15), ("mtcc", 25), ("afilc", 20), ("iplc", 25)]
 )
-def test_the_claims_of_a_paper_come_out_as_found(tmp_path: Path, paper: str, least: int) -> None:
+def test_the_claims_of_a_paper_come_out_as_found(
+    ato_hil, tmp_path: Path, paper: str, least: int
+) -> None:
     done = ato_hil("claims", paper, "--json", "claims.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "claims.json").read_text())["claims"]

@@ -58,18 +58,6 @@ def short(
     return "short.toml"
 
 
-def ato_hil(*arguments: str, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tools.cli", *arguments],
-        cwd=cwd,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=900,
-        check=False,
-    )
-
-
 def summary(folder: Path) -> dict:
     return json.loads((folder / "summary.json").read_text())
 
@@ -82,7 +70,7 @@ def channel(tmp_path: Path) -> str:
 # Modes.
 
 
-def test_hil_with_a_bus_for_each_train_gives_the_bits_of_sil(tmp_path: Path) -> None:
+def test_hil_with_a_bus_for_each_train_gives_the_bits_of_sil(ato_hil, tmp_path: Path) -> None:
     name = short(tmp_path, duration_s=8.0, more="runs = 2")
     sil = ato_hil("run", name, "--mode", "sil", "--out", "sil", cwd=tmp_path)
     assert sil.returncode == 0, sil.stderr
@@ -115,7 +103,7 @@ def _entities(trace: Path) -> set[str]:
     return {chunk.entity_path for chunk in RrdReader(str(trace)).stream()}
 
 
-def test_the_interpreted_line_gives_the_bits_of_the_compiled_one(tmp_path: Path) -> None:
+def test_the_interpreted_line_gives_the_bits_of_the_compiled_one(ato_hil, tmp_path: Path) -> None:
     name = short(tmp_path, trains=2, duration_s=6.0)
     digests = []
     for mode in ("sil", "mil"):
@@ -126,7 +114,7 @@ def test_the_interpreted_line_gives_the_bits_of_the_compiled_one(tmp_path: Path)
 
 
 @pytest.mark.long
-def test_thirty_two_trains_on_thirty_two_buses_lose_no_frame(tmp_path: Path) -> None:
+def test_thirty_two_trains_on_thirty_two_buses_lose_no_frame(ato_hil, tmp_path: Path) -> None:
     """The digest of SIL says that every frame of every bus was recorded."""
     hil = ato_hil(
         "run", "line-32", "--bus", channel(tmp_path), "--no-trace", "--out", "hil", cwd=tmp_path
@@ -144,7 +132,7 @@ def test_thirty_two_trains_on_thirty_two_buses_lose_no_frame(tmp_path: Path) -> 
 # What the summary says.
 
 
-def test_the_summary_has_a_row_for_each_train(tmp_path: Path) -> None:
+def test_the_summary_has_a_row_for_each_train(ato_hil, tmp_path: Path) -> None:
     name = short(tmp_path)
     done = ato_hil("run", name, "--mode", "sil", "--no-trace", "--out", "o", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -247,7 +235,7 @@ def test_each_train_has_a_bus(name: str, trains: int, buses: list[str]) -> None:
     ],
 )
 def test_what_is_for_one_train_is_refused(
-    tmp_path: Path, option: str, value: str, what: str
+    ato_hil, tmp_path: Path, option: str, value: str, what: str
 ) -> None:
     done = ato_hil("run", "line", option, value, "--out", "o", cwd=tmp_path)
     assert done.returncode == 1

@@ -19,41 +19,13 @@ import pytest
 from tools.cli import Mode, Screen
 from tools.session import Options, SessionError, run
 
-SHORT = """
-base = "subway-fast"
-title = "A short run between two stops"
-runs = 2
-
-[profile]
-duration_s = 20.0
-distance_m = 45.0
-max_speed_m_s = 5.0
-ramps = [
-    {{ to_m_s = "solved", start_s = 1.0, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 }},
-    {{ to_m_s = 0.0, end_s = 18.0, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 }},
-]
-{more}
-"""
-
 
 @pytest.fixture
-def short(tmp_path: Path) -> Path:
+def short(short_text, tmp_path: Path) -> Path:
     """A scenario of 2001 ticks."""
     path = tmp_path / "short.toml"
-    path.write_text(SHORT.format(more=""))
+    path.write_text(short_text)
     return path
-
-
-def ato_hil(*arguments: str, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tools.cli", *arguments],
-        cwd=cwd,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
 
 
 def summary(folder: Path) -> dict:
@@ -65,7 +37,7 @@ def channel(tmp_path: Path) -> str:
     return f"hub:{tmp_path.name[-20:]}"
 
 
-def test_hil_gives_the_bits_of_sil(short: Path, tmp_path: Path) -> None:
+def test_hil_gives_the_bits_of_sil(ato_hil, short: Path, tmp_path: Path) -> None:
     sil = ato_hil(
         *("run", str(short), "--mode", "sil", "--out", "sil", "--record", "sil.log"), cwd=tmp_path
     )
@@ -85,11 +57,11 @@ def test_hil_gives_the_bits_of_sil(short: Path, tmp_path: Path) -> None:
     assert (tmp_path / "hil" / "trace.rrd").stat().st_size > 100_000
 
 
-def test_runs_of_different_length_are_no_fault(tmp_path: Path) -> None:
+def test_runs_of_different_length_are_no_fault(ato_hil, short_text, tmp_path: Path) -> None:
     """Each is cut while the train still moves; the next goes on from what it learned."""
     path = tmp_path / "lengths.toml"
     path.write_text(
-        SHORT.format(more="[run_length]\nshortest_s = 10.0\nlongest_s = 16.0\nfirst_s = 11.5")
+        short_text + "\n[run_length]\nshortest_s = 10.0\nlongest_s = 16.0\nfirst_s = 11.5\n"
     )
     options = ("run", str(path), "--runs", "3", "--no-trace")
     sil = ato_hil(*options, "--mode", "sil", "--out", "sil", cwd=tmp_path)
@@ -108,7 +80,7 @@ def test_runs_of_different_length_are_no_fault(tmp_path: Path) -> None:
     assert one["controller"]["memory_bytes"] > 0
 
 
-def test_the_summary_has_its_stable_keys(short: Path, tmp_path: Path) -> None:
+def test_the_summary_has_its_stable_keys(ato_hil, short: Path, tmp_path: Path) -> None:
     done = ato_hil(
         "run", str(short), "--mode", "sil", "--no-trace", "--seed", "7", "--out", "o", cwd=tmp_path
     )
@@ -140,9 +112,11 @@ def test_the_summary_has_its_stable_keys(short: Path, tmp_path: Path) -> None:
     assert found["runs"][0]["ticks"] == 2001
 
 
-def test_the_interpreted_run_gives_the_bits_of_the_compiled_one(tmp_path: Path) -> None:
+def test_the_interpreted_run_gives_the_bits_of_the_compiled_one(
+    ato_hil, short_text, tmp_path: Path
+) -> None:
     path = tmp_path / "short.toml"
-    path.write_text(SHORT.format(more="").replace("runs = 2", "runs = 1"))
+    path.write_text(short_text.replace("runs = 2", "runs = 1"))
     digests = []
     for mode in ("sil", "mil"):
         done = ato_hil("run", str(path), "--mode", mode, "--no-trace", "--out", mode, cwd=tmp_path)
@@ -151,7 +125,7 @@ def test_the_interpreted_run_gives_the_bits_of_the_compiled_one(tmp_path: Path) 
     assert digests[0] == digests[1]
 
 
-def test_learning_goes_on_from_a_memory_file(short: Path, tmp_path: Path) -> None:
+def test_learning_goes_on_from_a_memory_file(ato_hil, short: Path, tmp_path: Path) -> None:
     arguments = ("run", str(short), "--mode", "sil", "--no-trace", "--memory", "learned.bin")
     first = ato_hil(*arguments, "--runs", "1", "--out", "a", cwd=tmp_path)
     second = ato_hil(*arguments, "--runs", "1", "--out", "b", cwd=tmp_path)
@@ -184,7 +158,9 @@ def test_learning_goes_on_from_a_memory_file(short: Path, tmp_path: Path) -> Non
         (["run", "subway", "--record", "no/x.blf"], "no/x.blf: there is no folder"),
     ],
 )
-def test_bad_input_is_one_clear_line(tmp_path: Path, arguments: list[str], says: str) -> None:
+def test_bad_input_is_one_clear_line(
+    ato_hil, tmp_path: Path, arguments: list[str], says: str
+) -> None:
     wrong = {
         "wrong": '[actuator]\nforce_max_m_s2 = "much"',
         "extra": '[sensors]\ncolour = "red"',
@@ -230,7 +206,7 @@ def test_options_that_do_not_go_together(tmp_path: Path, more: dict[str, Any], s
     assert not (tmp_path / "out").exists()
 
 
-def test_a_dbc_without_a_needed_signal_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_dbc_without_a_needed_signal_is_one_clear_line(ato_hil, tmp_path: Path) -> None:
     from can_dbc.step import dbc_path
 
     text = dbc_path().read_text()
@@ -306,7 +282,7 @@ def children(process: subprocess.Popen[str]) -> dict[str, int]:
     ],
 )
 def test_what_ends_a_run_early_is_named_and_leaves_nothing_behind(
-    tmp_path: Path, victim: str | None, number: signal.Signals, says: str, code: int
+    ato_hil, tmp_path: Path, victim: str | None, number: signal.Signals, says: str, code: int
 ) -> None:
     process = start_long_run(tmp_path)
     nodes = children(process)
@@ -336,7 +312,7 @@ def test_what_ends_a_run_early_is_named_and_leaves_nothing_behind(
         assert "commands as recorded" in again.stdout.splitlines()[-1]
 
 
-def test_two_sessions_do_not_share_a_bus(tmp_path: Path) -> None:
+def test_two_sessions_do_not_share_a_bus(ato_hil, tmp_path: Path) -> None:
     process = start_long_run(tmp_path)
     try:
         second = ato_hil("run", "subway", "--bus", channel(tmp_path), "--out", "b", cwd=tmp_path)
@@ -348,7 +324,7 @@ def test_two_sessions_do_not_share_a_bus(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_paper_s_figures_come_over_the_bus(tmp_path: Path) -> None:
+def test_the_paper_s_figures_come_over_the_bus(ato_hil, tmp_path: Path) -> None:
     """Row A1 with separate processes, and the digest of SIL."""
     arguments = ("run", "subway-paper", "--no-trace")
     hil = ato_hil(*arguments, "--bus", channel(tmp_path), "--out", "hil", cwd=tmp_path)

@@ -18,21 +18,7 @@ from plant_sim.scenario import ScenarioError, load, overlaid
 from tools import sweep
 from tools.sweep import SweepError, pareto, parse_vary, plan
 
-SHORT = """
-base = "subway-fast"
-title = "A short run between two stops"
-law = "pid"
-runs = 2
-
-[profile]
-duration_s = 20.0
-distance_m = 45.0
-max_speed_m_s = 5.0
-ramps = [
-    { to_m_s = "solved", start_s = 1.0, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 },
-    { to_m_s = 0.0, end_s = 18.0, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 },
-]
-
+CASES = """
 [cases.weak]
 laws.pid = { gp = 2e4 }
 """
@@ -126,19 +112,8 @@ def test_a_plot_is_written_and_the_same_each_time(tmp_path: Path) -> None:
     assert (tmp_path / "three.png").read_bytes().startswith(b"\x89PNG")
 
 
-def ato_hil(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tools.cli", *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=900,
-        check=False,
-    )
-
-
-def test_the_command_writes_table_and_plot(tmp_path: Path) -> None:
-    (tmp_path / "short.toml").write_text(SHORT)
+def test_the_command_writes_table_and_plot(ato_hil, short_text, tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text(f'law = "pid"\n{short_text}{CASES}')
     done = ato_hil(
         *("sweep", "short.toml", "--vary", "law.gp=1e5,3e5", "--vary", "law.gI=1.0", "--out", "o"),
         cwd=tmp_path,
@@ -163,7 +138,7 @@ def test_the_command_writes_table_and_plot(tmp_path: Path) -> None:
     assert sweep.measure(point) == rows[0]
 
 
-def test_bad_input_is_one_line_and_writes_nothing(tmp_path: Path) -> None:
+def test_bad_input_is_one_line_and_writes_nothing(ato_hil, tmp_path: Path) -> None:
     done = ato_hil("sweep", "gradient", "--vary", "law.S", "--out", "o", cwd=tmp_path)
     assert done.returncode == 1
     assert done.stderr.strip() == (
@@ -205,3 +180,13 @@ def test_ctrl_c_ends_every_process_with_one_line(tmp_path: Path) -> None:
     while any(map(runs, workers)):  # the tracker ends when it sees that the others have
         time.sleep(0.1)
     assert list((tmp_path / "o").iterdir()) == []
+
+
+@pytest.mark.long
+def test_a_row_of_a_line_is_its_worst_train() -> None:
+    (point,) = plan("line", None, ["line.trains=2"], 1, 1)
+    row = sweep.measure(point)
+    assert row["line.trains"] == 2
+    assert 0.0 < row["max_position_error_m"] < 0.2
+    assert 500.0 < row["min_separation_m"] < 520.0
+    assert "trains" not in row

@@ -114,7 +114,7 @@ def run(base: str, text: str = "", law: str | None = None, seed: int = 1) -> Run
     period_s = loaded.scenario.period_s
     outside = np.flatnonzero((np.abs(error) >= 0.2).any(axis=0))
     return Run(
-        row=line.run_row(trains, law, [result.frames for result in results], truths),
+        row=line.row_of(trains, law, results),
         faults={name for result in results for name in result.faults},
         least_error_m=error.min(axis=1),
         largest_error_m=error.max(axis=1),

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import tempfile
+import tomllib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
-from plant_sim.scenario import Loaded, load, members
+from plant_sim.scenario import Loaded, load, members, overlaid
 from tools import line, setup, sil
 
 
@@ -80,8 +79,7 @@ def runs(
     nodes = setup.controllers_for(trains, law)
     rows = []
     for results in sil.run_line(loaded, nodes, runs=setup.run_numbers(law, count), seed=seed):
-        frames, truths = [r.frames for r in results], [r.truth for r in results]
-        row = line.run_row(trains, law, frames, truths)
+        row = line.row_of(trains, law, results)
         faults = [name for result in results for name in result.faults]
         rows.append({**row, "run": results[0].run, "faults": faults})
     return rows
@@ -89,10 +87,7 @@ def runs(
 
 def variant(base: str, text: str) -> Loaded:
     """The scenario `base` with the TOML `text` on top."""
-    with tempfile.TemporaryDirectory(prefix="ato-hil-") as folder:
-        path = Path(folder) / f"{base}-variant.toml"
-        path.write_text(f'base = "{base}"\n{text}', encoding="utf-8")
-        return load(str(path))
+    return overlaid(base, tomllib.loads(text))
 
 
 def worst(rows: list[dict[str, Any]], key: str) -> float:

@@ -6,9 +6,19 @@ A check is a generator of rows. It never passes what it could not look at: a mis
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
+from typing import TypeVar
+
+import msgspec
 
 PASSED, FAILED, ABSENT = "passed", "failed", "absent"
+
+
+Report = TypeVar("Report")
+PROCESS_TIMEOUT_S = 1800.0
 
 
 class VerifyError(ValueError):
@@ -29,3 +39,22 @@ class Row:
 def row(name: str, subject: str, how: str, result: str, passed: bool) -> Row:
     """A row that passed or failed."""
     return Row(name, subject, how, result, PASSED if passed else FAILED)
+
+
+def asked(
+    kind: type[Report], module: str, arguments: list[str], environment: dict[str, str]
+) -> Report:
+    """What `python -m MODULE ARGUMENTS` prints last: a JSON object of the struct `kind`, whose
+    `error` names the reason if the process fails."""
+    process = subprocess.run(
+        [sys.executable, "-m", module, *arguments],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=PROCESS_TIMEOUT_S,
+        check=False,
+    )
+    if process.returncode != 0:
+        last = (process.stderr.strip().splitlines() or ["no message"])[-1]
+        return kind(error=f"the process of {module} failed: {last}")  # type: ignore[call-arg]
+    return msgspec.json.decode(process.stdout.splitlines()[-1], type=kind)

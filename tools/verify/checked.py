@@ -13,8 +13,6 @@ object: WholeRuns.
 from __future__ import annotations
 
 import operator
-import os
-import subprocess
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -24,10 +22,8 @@ from numba.core import lowering, types
 from numba.core.imputils import lower_builtin, lower_cast
 
 from can_dbc.step import cache_directory
-from tools.verify import identity
+from tools.verify import asked, identity
 from tools.verify.overflow import where
-
-TIMEOUT_S = 1800.0
 
 
 class WholeRuns(msgspec.Struct, frozen=True):
@@ -123,18 +119,8 @@ def whole_runs(law: str, scenarios: list[str]) -> WholeRuns:
 def ask(law: str, scenarios: list[str]) -> WholeRuns:
     """WholeRuns of a law in a process of its own."""
     cache = cache_directory() / "checked"
-    process = subprocess.run(
-        [sys.executable, "-m", "tools.verify.checked", law, *scenarios],
-        env={**os.environ, "NUMBA_CACHE_DIR": str(cache)},
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-        check=False,
-    )
-    if process.returncode != 0:
-        last = (process.stderr.strip().splitlines() or ["no message"])[-1]
-        return WholeRuns(error=f"the checked process failed: {last}")
-    return msgspec.json.decode(process.stdout.splitlines()[-1], type=WholeRuns)
+    environment = {"NUMBA_CACHE_DIR": str(cache)}
+    return asked(WholeRuns, "tools.verify.checked", [law, *scenarios], environment)
 
 
 def main(arguments: list[str]) -> None:

@@ -264,7 +264,7 @@ def send_loop(n: Any, state: Any, tx: Any) -> None:
     """One frame encoded and protected."""
     for k in range(n):
         word = codec.put(FORCE_CMD.Force, k) + codec.put(FORCE_CMD.Tick, k)
-        firmware.send(state[0].core, tx, FORCE_CMD, word)
+        e2e.send(state[0].core, tx, FORCE_CMD, word)
 
 
 def build_tick_loop(tick: Any) -> Any:

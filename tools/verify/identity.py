@@ -21,6 +21,7 @@ from can_dbc.hub import DEFAULT_CHANNEL
 from controller.registry import is_file, load_law
 from plant_sim.scenario import Loaded, case_names, load, members, scenario_names
 from tools import line, setup, sil
+from tools.files import write_json
 from tools.frames import LineDigest
 from tools.verify import ABSENT, FAILED, Row, VerifyError, row
 
@@ -103,9 +104,8 @@ def measured(scenario: str, law: str, runs: int, ticks: int = 0) -> Golden:
     row: dict[str, Any] = {}
     nodes = setup.controllers_for(trains, law)
     for results in sil.run_line(loaded, nodes, runs=setup.run_numbers(law, runs), seed=SEED):
-        frames = [result.frames for result in results]
-        digest.update(frames)
-        row = line.run_row(trains, law, frames, [result.truth for result in results])
+        digest.update([result.frames for result in results])
+        row = line.row_of(trains, law, results)
     return Golden(digest.hex(), runs, {name: row.get(name) for name in GOLDEN_METRICS})
 
 
@@ -126,9 +126,7 @@ def read_golden(path: Path = GOLDEN) -> dict[str, Golden]:
 def write_golden(golden: dict[str, Golden], path: Path = GOLDEN) -> None:
     """Writes the golden file whole or not at all, sorted."""
     content = {key: msgspec.to_builtins(golden[key]) for key in sorted(golden)}
-    temporary = path.with_suffix(".new")
-    temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_json(path, content)
 
 
 def renew(laws: list[str], path: Path = GOLDEN) -> Iterator[str]:

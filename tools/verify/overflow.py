@@ -8,8 +8,6 @@ if ATO_HIL_INTERPRETED is set before they are imported. It prints one JSON objec
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
 import sys
 import traceback
 from pathlib import Path
@@ -23,6 +21,9 @@ from can_dbc.step import INTERPRETED
 from controller.interface import INPUTS, OUTPUTS
 from controller.memory import CELL
 from controller.registry import law_step, load_law
+from plant_sim.scenario import load
+from tools.setup import calibration_for
+from tools.verify import asked, identity
 
 ROOT = Path(__file__).resolve().parents[2]
 LAWS = "controller/laws/"
@@ -209,56 +210,30 @@ def _show(records: list[np.ndarray]) -> str:
     )
 
 
-def scenario_run(scenario: str, law: str, runs: int, ticks: int) -> Report:
-    """Runs of a scenario on checked integers, plant and controller and every frame; `ticks` 0:
-    whole runs."""
-    from plant_sim.scenario import load, members
-    from tools import setup, sil
-    from tools.frames import LineDigest
-    from tools.verify.identity import shortened
-
-    loaded = shortened(load(scenario), ticks)
+def first_ticks(scenario: str, law: str, ticks: int) -> Report:
+    """The first ticks of a scenario on checked integers, plant and controller and every frame."""
     peaks = _Peaks()
     peaks.install()
-    nodes = setup.controllers_for(members(loaded), law)
-    digest = LineDigest(len(nodes))
-    numbers = setup.run_numbers(law, runs)
     try:
-        for results in sil.run_line(loaded, nodes, runs=numbers, seed=1):
-            digest.update([result.frames for result in results])
+        digest = identity.measured(scenario, law, 1, ticks).digest
     except OverflowError as error:
         return Report(error=where(error))
     bits, at = peaks.largest(load_law(law))
-    cases = runs * loaded.ticks * len(nodes)
-    return Report(bits=bits, at=at, cases=cases, digest=digest.hex())
+    return Report(bits=bits, at=at, cases=ticks, digest=digest)
 
 
 def calibrated(law: str) -> list[np.ndarray]:
     """PARAMS of a law in every scenario that has gains for it."""
-    from plant_sim.scenario import load
-    from tools.setup import calibration_for
-    from tools.verify.identity import scenarios_of
-
     return [
         np.ascontiguousarray(calibration_for(load(name), law).params["law"])
-        for name in scenarios_of(law)
+        for name in identity.scenarios_of(law)
     ]
 
 
-def ask(*arguments: str, timeout_s: float = 1800) -> Report:
+def ask(*arguments: str) -> Report:
     """A Report of this module in a process of its own, where the steps are interpreted."""
-    process = subprocess.run(
-        [sys.executable, "-m", "tools.verify.overflow", *arguments],
-        env={**os.environ, "ATO_HIL_INTERPRETED": "1"},
-        capture_output=True,
-        text=True,
-        timeout=timeout_s,
-        check=False,
-    )
-    if process.returncode != 0:
-        last = (process.stderr.strip().splitlines() or ["no message"])[-1]
-        return Report(error=f"the interpreted process failed: {last}")
-    return msgspec.json.decode(process.stdout.splitlines()[-1], type=Report)
+    environment = {"ATO_HIL_INTERPRETED": "1"}
+    return asked(Report, "tools.verify.overflow", list(arguments), environment)
 
 
 def main(arguments: list[str]) -> None:
@@ -267,15 +242,14 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("law")
     parser.add_argument("--cases", type=int, default=0)
     parser.add_argument("--scenario", default="")
-    parser.add_argument("--runs", type=int, default=1)
     parser.add_argument("--ticks", type=int, default=0)
-    asked = parser.parse_args(arguments)
+    given = parser.parse_args(arguments)
     if not INTERPRETED:
         raise SystemExit("expected ATO_HIL_INTERPRETED=1")
-    if asked.scenario:
-        report = scenario_run(asked.scenario, asked.law, asked.runs, asked.ticks)
+    if given.scenario:
+        report = first_ticks(given.scenario, given.law, given.ticks)
     else:
-        report = search(load_law(asked.law), calibrated(asked.law), asked.cases)
+        report = search(load_law(given.law), calibrated(given.law), given.cases)
     print(msgspec.json.encode(report).decode())
 
 

@@ -168,6 +168,17 @@ def _errors(p: Any, own: Any, inputs: Any) -> None:
 
 
 @step
+def _held(p: Any, own: Any, inputs: Any) -> Any:
+    """Whether the brake holds the train at its stop; else the errors of this tick are in `own`."""
+    if inputs.tick == 0:
+        _begin(p, own)
+    stopped = _at_stop(inputs)
+    if not stopped:
+        _errors(p, own, inputs)
+    return stopped
+
+
+@step
 def _feed_forward(inputs: Any) -> Any:
     return q27(inputs.ahead_acceleration) + q27(inputs.map_acceleration)
 
@@ -269,11 +280,8 @@ def _project(p: Any, own: Any) -> None:
 @step
 def _adaptive(p: Any, own: Any, inputs: Any, robust: Any) -> Any:
     """u / M of drac, and of drac_robust."""
-    if inputs.tick == 0:
-        _begin(p, own)
-    if _at_stop(inputs):
+    if _held(p, own, inputs):
         return p.hold
-    _errors(p, own, inputs)
     v = q24(inputs.speed)
     z2 = p.c1 * own.z1 + own.e2
     q = _q(p, own, z2, inputs)
@@ -305,11 +313,8 @@ def _drac_robust_force(p: Any, state: Any, inputs: Any) -> Any:
 def _drac_exact_force(p: Any, state: Any, inputs: Any) -> Any:
     """(11), (34)"""
     own = state.own
-    if inputs.tick == 0:
-        _begin(p, own)
-    if _at_stop(inputs):
+    if _held(p, own, inputs):
         return p.hold
-    _errors(p, own, inputs)
     v = q24(inputs.speed)
     swing = math.sin(p.turn * inputs.tick)
     b = _q(p, own, p.c1 * own.z1 + own.e2, inputs)
@@ -323,11 +328,8 @@ def _drac_exact_force(p: Any, state: Any, inputs: Any) -> Any:
 @step
 def _pid_force(p: Any, state: Any, inputs: Any) -> Any:
     own = state.own
-    if inputs.tick == 0:
-        _begin(p, own)
-    if _at_stop(inputs):
+    if _held(p, own, inputs):
         return p.hold
-    _errors(p, own, inputs)
     more_traction = own.z1 < 0.0 and (own.cut > 0.0 or inputs.limited != 0)
     more_brake = own.z1 > 0.0 and own.cut < 0.0
     if not (more_traction or more_brake or own.clamped != 0.0):
