@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from can_dbc.codec import MAILBOX, MESSAGE_COUNT, NEIGHBOUR_AHEAD_POSITION
-from can_dbc.step import INTERPRETED
+from can_dbc.step import INTERPRETED, step
 from plant_sim import actuator, plant, track
 from plant_sim.line import Fault
 from plant_sim.scenario import MODELS, Loaded, Scenario, members
@@ -24,6 +24,7 @@ SPEED_NOISE, DISTURBANCE, LOST_AHEAD, LOST_BEHIND = 0, 1, 2, 3
 STREAMS = 4  # of a train
 RUN_LENGTH = LOST_AHEAD  # of a run: the leader has no train ahead whose packets are lost
 NEVER = 2**62  # tick
+TICKS_AT_ONCE = 4096  # for which noise is drawn: what it takes stays in the processor's cache
 
 
 @dataclass
@@ -160,13 +161,51 @@ def run_ticks(loaded: Loaded, seed: int, run: int) -> int:
 
 def _bits(seed: int, run: int, stream: int, count: int) -> np.ndarray:
     """`count` random 64-bit words, a function of seed, run and stream alone."""
-    generator = np.random.Philox(key=[seed, (run << 8) + stream])
+    return _words(_generator(seed, run, stream), count)
+
+
+def _generator(seed: int, run: int, stream: int) -> np.random.Philox:
+    """The source of a stream's words."""
+    return np.random.Philox(key=[seed, (run << 8) + stream])
+
+
+def _words(generator: np.random.Philox, count: int) -> np.ndarray:
+    """The next `count` words."""
     return np.asarray(generator.random_raw(count), np.uint64)
 
 
 def _uniform(words: np.ndarray) -> np.ndarray:
     """[0, 1) from the top 53 bits; exact, so that it is the same on every machine."""
     return (words >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+
+@step
+def uniform(word: Any) -> Any:
+    """[0, 1) from the top 53 bits; exact, so that it is the same on every machine."""
+    return (word >> np.uint64(11)) * 2.0**-53
+
+
+@step
+def sums_of_twelve(words: Any, noise: Any) -> None:
+    """`noise` [n] from random `words` [n, 12]: variance 1, mean 0; no logarithm whose last bit
+    depends on the machine, and the order of the sum is written down."""
+    for k in range(len(noise)):
+        row = words[k]
+        first = (uniform(row[0]) + uniform(row[1])) + (uniform(row[2]) + uniform(row[3]))
+        second = (uniform(row[4]) + uniform(row[5])) + (uniform(row[6]) + uniform(row[7]))
+        total = first + second
+        for i in range(8, 12):
+            total += uniform(row[i])
+        noise[k] = total - 6.0
+
+
+def _noise(generator: np.random.Philox, ticks: int) -> np.ndarray:
+    """Noise of unit variance [ticks]."""
+    noise = np.empty(ticks)
+    for first in range(0, ticks, TICKS_AT_ONCE):
+        part = noise[first : first + TICKS_AT_ONCE]
+        sums_of_twelve(_words(generator, 12 * len(part)).reshape(-1, 12), part)
+    return noise
 
 
 def chances(here: World, run: int) -> Any:
@@ -184,14 +223,12 @@ def chance(loaded: Loaded, seed: int, run: int) -> np.ndarray:
     first = STREAMS * loaded.train
     drawn = np.zeros(ticks, plant.CHANCE)
     if loaded.scenario.sensors.speed_noise_m_s > 0:
-        # Sum of twelve uniforms: variance 1, no logarithm whose last bit depends on the machine.
-        words = _bits(seed, run, first + SPEED_NOISE, 12 * ticks).reshape(ticks, 12)
-        drawn["speed_noise"] = _uniform(words).sum(axis=1) - 6.0
+        drawn["speed_noise"] = _noise(_generator(seed, run, first + SPEED_NOISE), ticks)
     disturbance = loaded.scenario.disturbance
     if disturbance.amplitude_m_s2 > 0:
         values = -(-ticks // disturbance.hold_ticks)
-        uniform = _uniform(_bits(seed, run, first + DISTURBANCE, values))
-        held = np.repeat(2.0 * uniform - 1.0, disturbance.hold_ticks)[:ticks]
+        drawn_values = _uniform(_bits(seed, run, first + DISTURBANCE, values))
+        held = np.repeat(2.0 * drawn_values - 1.0, disturbance.hold_ticks)[:ticks]
         drawn["disturbance_m_s2"] = disturbance.amplitude_m_s2 * held
     if loaded.scenario.line:
         radio = loaded.scenario.line.radio
