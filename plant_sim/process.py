@@ -13,6 +13,7 @@ import queue
 import sys
 import time
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ import numpy as np
 
 from can_dbc.bus import BusError, open_bus, recv_frames, send_frames
 from can_dbc.child import Stop, follow_parent, tell
-from can_dbc.codec import ATO_STATUS, FORCE_CMD, INDEX_OF_FRAME_ID, MESSAGES, get
+from can_dbc.codec import ATO_STATUS, FORCE_CMD, MESSAGES, get
+from can_dbc.faults import PLANT, receiver
+from can_dbc.inbox import Inbox, intact
 from plant_sim import plant, world
 from plant_sim.scenario import ScenarioError, load
 
@@ -53,23 +56,32 @@ def post(here: world.World, train: int, bus: can.BusABC) -> None:
     send_frames(bus, frames)
 
 
-def collect(here: world.World, train: int, bus: can.BusABC, timeout_s: float) -> list[int]:
-    """Received frames into a train's mailboxes; the identifiers of those that the plant knows."""
-    known = []
-    payloads, fresh = here.rx["payload"][train], here.rx["fresh"][train]
-    for frame_id, payload in recv_frames(bus, timeout_s):
-        index = INDEX_OF_FRAME_ID.get(frame_id)
-        if index is not None:
-            payloads[index] = payload
-            fresh[index] = 1
-            known.append(frame_id)
-    return known
+@dataclass(frozen=True)
+class Port:
+    """A train's bus, and the way from it into the train's mailboxes."""
+
+    bus: can.BusABC
+    inbox: Inbox
+
+
+def port_of(here: world.World, train: int, bus: can.BusABC, faults: Path | None) -> Port:
+    """The port of a train; `faults` is the folder of `can_dbc.faults.receiver`."""
+    counters = here.state["node"]["received"][train]
+    return Port(bus, Inbox(here.rx[train], counters, receiver(faults, PLANT, train)))
+
+
+def collect(port: Port, timeout_s: float) -> list[tuple[int, int]]:
+    """Frames into a train's mailboxes; as they came from the bus."""
+    frames = recv_frames(port.bus, timeout_s)
+    for frame in frames:
+        port.inbox.take(*frame)
+    return frames
 
 
 def agree(
     here: world.World,
     train: int,
-    bus: can.BusABC,
+    port: Port,
     run_state: int,
     run: int,
     timeout_s: float,
@@ -87,11 +99,13 @@ def agree(
         before = answered
         if faults is None:
             plant.announce(node, run_state, run, here.tx[train])
-            post(here, train, bus)
+            post(here, train, port.bus)
             sent += 1
         until = time.monotonic() + REPEAT_S
         while time.monotonic() < until:
-            answered += collect(here, train, bus, REPEAT_S).count(ATO_STATUS.frame_id)
+            answered += sum(
+                frame_id == ATO_STATUS.frame_id for frame_id, _ in collect(port, REPEAT_S)
+            )
             if plant.confirmed(node, rx):
                 faults = int(get(int(rx["payload"][ATO_STATUS.index]), ATO_STATUS.Faults))
             rx["fresh"][:] = 0
@@ -111,7 +125,7 @@ def agree(
 
 def drive(
     here: world.World,
-    buses: list[can.BusABC],
+    ports: list[Port],
     run: int,
     truth: np.ndarray,
     timeout_s: float,
@@ -121,14 +135,16 @@ def drive(
     chance = world.chances(here, run)
     here.begin(here.params, here.state)
     rx_fresh = here.rx["fresh"]
+    for port in ports:
+        port.inbox.begin_run(run)
     next_progress = time.monotonic()
     for tick in range(truth.shape[1]):
         here.sense(here.params, here.limits, here.state, chance, tick, here.tx)
-        for train, bus in enumerate(buses):
-            post(here, train, bus)
+        for train, port in enumerate(ports):
+            post(here, train, port.bus)
         deadline = time.monotonic() + timeout_s
-        for train, bus in enumerate(buses):
-            answer(here, train, bus, run, tick, deadline, timeout_s, stop)
+        for train, port in enumerate(ports):
+            answer(here, train, port, run, tick, deadline, timeout_s, stop)
         here.actuate_and_advance(here.params, here.track, here.state, chance, tick, here.rx, truth)
         rx_fresh.fill(0)
         if stop.requested:
@@ -136,25 +152,26 @@ def drive(
         if tick & 63 == 0 and time.monotonic() >= next_progress:
             next_progress = time.monotonic() + PROGRESS_S
             tell("progress", run=run, tick=tick)
+    for port in ports:
+        port.inbox.end_run()
 
 
 def answer(
     here: world.World,
     train: int,
-    bus: can.BusABC,
+    port: Port,
     run: int,
     tick: int,
     deadline: float,
     timeout_s: float,
     stop: Stop,
 ) -> None:
-    """Waits until a train's controller has answered a tick. Raises SilentNode or Stopped."""
-    payload = here.rx["payload"][train]
+    """Waits until a train's controller has answered a tick, whatever a fault of the session then
+    makes of the answer. Raises SilentNode or Stopped."""
     while True:
-        if FORCE_CMD.frame_id in collect(here, train, bus, timeout_s):
-            echo = (int(payload[FORCE_CMD.index]) >> TICK_START) & plant.TICK_MASK
-            if echo == tick & plant.TICK_MASK:
-                return
+        if any(echoes(tick, *frame) for frame in collect(port, timeout_s)):
+            port.inbox.close_tick()
+            return
         if stop.requested:
             raise Stopped
         if time.monotonic() >= deadline:
@@ -164,9 +181,18 @@ def answer(
             )
 
 
+def echoes(tick: int, frame_id: int, payload: int) -> bool:
+    """Whether a frame is the answer to a tick."""
+    return (
+        frame_id == FORCE_CMD.frame_id
+        and (payload >> TICK_START) & plant.TICK_MASK == tick & plant.TICK_MASK
+        and intact(FORCE_CMD, payload)
+    )
+
+
 def one_run(
     here: world.World,
-    buses: list[can.BusABC],
+    ports: list[Port],
     run: int,
     out: Path,
     arming_s: float,
@@ -175,13 +201,13 @@ def one_run(
 ) -> None:
     """Arms, drives and ends one run; its truth is written even if it is cut short."""
     ticks = here.ticks(run)
-    truth = np.zeros((len(buses), ticks), plant.TRUTH)
+    truth = np.zeros((len(ports), ticks), plant.TRUTH)
     file = out / f"truth_{run}.npy"
-    for train, bus in enumerate(buses):
-        agree(here, train, bus, plant.ARMED, run, arming_s, stop)
+    for train, port in enumerate(ports):
+        agree(here, train, port, plant.ARMED, run, arming_s, stop)
     started = time.perf_counter()
     try:
-        drive(here, buses, run, truth, timeout_s, stop)
+        drive(here, ports, run, truth, timeout_s, stop)
     except (SilentNode, Stopped):
         done = int(here.state[0]["node"]["tick"])
         np.save(file, truth[:, :done])
@@ -190,8 +216,8 @@ def one_run(
     seconds = time.perf_counter() - started
     np.save(file, truth)
     faults = [
-        agree(here, train, bus, plant.ENDED, run, 2 * timeout_s, stop)
-        for train, bus in enumerate(buses)
+        agree(here, train, port, plant.ENDED, run, 2 * timeout_s, stop)
+        for train, port in enumerate(ports)
     ]
     tell(
         "run",
@@ -218,6 +244,7 @@ def main() -> int:
     parser.add_argument(
         "--patience", type=float, default=2.0, help="longest wait for the first answer, s"
     )
+    parser.add_argument("--faults", type=Path, metavar="DIR", help="with the plan and the logs")
     arguments = parser.parse_args()
     stop = Stop()
     commands: queue.Queue[dict[str, Any]] = queue.Queue()
@@ -227,6 +254,7 @@ def main() -> int:
         here = world.build(load(arguments.scenario), arguments.seed)
         warm_up(here)
         buses = [opened.enter_context(open_bus(name)) for name in arguments.bus]
+        ports = [port_of(here, train, bus, arguments.faults) for train, bus in enumerate(buses)]
     except (ScenarioError, BusError) as error:
         opened.close()
         tell("error", message=str(error))
@@ -237,7 +265,7 @@ def main() -> int:
             time.sleep(0.005)
         arming_s = arguments.patience
         for run in range(arguments.first_run, arguments.last_run + 1):
-            one_run(here, buses, run, arguments.out, arming_s, arguments.timeout, stop)
+            one_run(here, ports, run, arguments.out, arming_s, arguments.timeout, stop)
             arming_s = 2 * arguments.timeout
     except Stopped:
         return 0

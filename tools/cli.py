@@ -245,6 +245,10 @@ def run(
         list[External] | None,
         typer.Option(help="A node of your own, started by yourself; may be given twice."),
     ] = None,
+    faults: Annotated[
+        Path | None,
+        typer.Option(help="Faults to inject, a .toml file: see docs/faults.md."),
+    ] = None,
 ) -> None:
     """Run a scenario: the train follows its profile, run by run."""
     if mode is Mode.mil and os.environ.get("ATO_HIL_INTERPRETED") != "1":
@@ -254,7 +258,7 @@ def run(
         os.execve(sys.executable, [sys.executable, "-m", "tools.cli", *sys.argv[1:]], environment)
     with one_line_for_bad_input():
         nodes = tuple(dict.fromkeys(node.value for node in external or ()))
-        _run(scenario, law, runs, mode, bus, seed, out, memory, trace, record, nodes)
+        _run(scenario, law, runs, mode, bus, seed, out, memory, trace, record, nodes, faults)
 
 
 @contextmanager
@@ -281,6 +285,7 @@ def _run(
     trace: bool,
     record: Path | None,
     external: tuple[str, ...],
+    faults: Path | None,
 ) -> None:
     from controller.registry import law_label
     from plant_sim.scenario import load
@@ -294,7 +299,8 @@ def _run(
         name = law_label(law or loaded.scenario.law)
     folder = out or Path("runs") / f"{loaded.folder_name}-{name}-{mode.value}"
     options = session.Options(
-        scenario, law, runs, mode.value, bus, seed, folder, memory, trace, record, external
+        *(scenario, law, runs, mode.value, bus, seed, folder, memory, trace, record, external),
+        faults=faults,
     )
     screen = Screen(mode)
     try:
@@ -314,6 +320,10 @@ def _run(
     if trace:
         trace_file = folder / "trace.rrd"
         console.print(f"trace   {trace_file}   (open it with: rerun {trace_file})", soft_wrap=True)
+    if faults is not None:
+        injected = ", ".join(f"{n} {kind}" for kind, n in summary["faults_injected"].items())
+        log = folder / "faults.csv"
+        console.print(f"faults  {log}   (injected: {injected or 'none'})", soft_wrap=True)
     if record is not None:
         console.print(f"record  {record}   (again: ato-hil replay {record})", soft_wrap=True)
 

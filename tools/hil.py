@@ -182,17 +182,21 @@ def run(
     recorder_arguments: list[str],
     external: Collection[str] = (),
     cars: int = 0,
+    faults: Path | None = None,
 ) -> Generator[tuple[Node, dict[str, Any], Bench], None, None]:
     """Events of the nodes, `ready` of each first, until all runs are done and recorded; see the
     `tell` calls of the processes.
 
     `buses` has an entry for each train, and so has `controllers`, or none where the controller is
-    one of the `external` nodes; `cars` are those that the plant takes a force for, each by itself.
+    one of the `external` nodes; `cars` are those that the plant takes a force for, each by itself;
+    `faults` is the folder of can_dbc.faults.receiver.
 
     Raises RunError with one line if a node dies, falls silent or reports an error.
     """
     on_buses = [word for bus in buses for word in ("--bus", bus)]
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, Bench(out) as bench:
+        injected = [] if faults is None else ["--faults", str(faults)]
+        recorder_arguments = [*recorder_arguments, *injected]
         recorder = bench.start("recorder", ["tools.recorder", *on_buses, *recorder_arguments])
         if external:
             watched = [word for name in external for word in ("--external", name)]
@@ -200,7 +204,7 @@ def run(
             leader = bench.start("observer", ["tools.observer", *on_buses, *watched])
         if PLANT not in external:
             plant_arguments = ["--scenario", scenario, "--seed", str(seed), "--out", scratch]
-            plant_arguments += ["--first-run", str(runs[0]), "--last-run", str(runs[-1])]
+            plant_arguments += ["--first-run", str(runs[0]), "--last-run", str(runs[-1]), *injected]
             if CONTROLLER in external:
                 plant_arguments += ["--patience", f"{PATIENCE_S + EXTERNAL_TIMEOUT_S}"]
                 plant_arguments += ["--timeout", f"{EXTERNAL_TIMEOUT_S}"]
@@ -210,6 +214,7 @@ def run(
             arguments = ["--calibration", str(flash(calibration, Path(scratch), name))]
             if memory_file is not None:
                 arguments += ["--memory", str(memory_file)]
+            arguments += [*injected, "--train", str(train)]
             bench.start(name, ["controller.process", "--bus", buses[train], *arguments])
             if train == 0:
                 bench.wait_ready()  # what the first controller compiles, the others load

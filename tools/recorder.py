@@ -45,6 +45,7 @@ from can_dbc import e2e
 from can_dbc.bus import FOREIGN, open_bus, recv_frames
 from can_dbc.child import Stop, follow_parent, tell
 from can_dbc.codec import FORCE_CMD, MESSAGES, RUN_CTRL, decode_column
+from can_dbc.faults import injected
 from can_dbc.hub_server import ERROR
 from tools.frames import (
     ENDED,
@@ -115,6 +116,7 @@ class Recorder:
         keep_frames: Path | None = None,
         train: int = 0,
         ended: Callable[[dict[str, Any]], None] = tell_run,
+        faults: Path | None = None,
     ) -> None:
         """Wait for the first run.
 
@@ -122,6 +124,7 @@ class Recorder:
         :param keep_frames: folder for `frames_RUN.npy`, the FRAME rows of each run.
         :param train: whose bus this is, 0 leads.
         :param ended: hears of each run that has ended.
+        :param faults: folder where the nodes log the faults that they inject.
         """
         self.run: int | None = None  # number of the current run
         self.tick = 0  # of the current run
@@ -129,6 +132,7 @@ class Recorder:
         self._keep_frames = keep_frames
         self._train = train
         self._ended = ended
+        self._faults = faults
         self._digest = Digest()
         self._rows = np.empty(FIRST_ROWS, FRAME)
         self._count = 0  # of _rows that are this run's
@@ -224,6 +228,13 @@ class Recorder:
             if lost or dropped_now:
                 text = f"recorder lost frames: {lost}, the bus dropped {dropped_now}"
                 self._trace.text(number, self.tick, text, "WARN", self._train)
+            if self._faults is not None:
+                here = [
+                    event
+                    for event in injected(self._faults)
+                    if (event.run, event.train) == (number, self._train + 1)
+                ]
+                self._trace.faults(number, here, self._train)
             if not complete:
                 text = f"cut short at tick {self.tick}"
                 self._trace.text(number, self.tick, text, "WARN", self._train)
@@ -336,6 +347,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder of trace.rrd")
     parser.add_argument("--trace", type=Path, metavar="FILE", help="from save_settings; else none")
     parser.add_argument("--keep-frames", type=Path, metavar="DIR", help="for frames_RUN.npy")
+    parser.add_argument("--faults", type=Path, metavar="DIR", help="with the logs of the nodes")
     arguments = parser.parse_args()
     stop = Stop()
     # A recorder without a parent ends with Ctrl-C, and keeps what it has.
@@ -354,7 +366,8 @@ def main() -> int:
             if kept is not None:
                 kept = frames_folder(kept, train)
                 kept.mkdir(exist_ok=True)
-            recorder = Recorder(trace, kept, train, partial(line.ended, train))
+            ended = partial(line.ended, train)
+            recorder = Recorder(trace, kept, train, ended, arguments.faults)
             taps.append((opened.enter_context(open_bus(name)), recorder))
     except (OSError, ValueError) as error:  # the bus, the trace, its settings
         opened.close()

@@ -28,7 +28,7 @@ from can_dbc.codec import (
 )
 from controller import node
 from controller.calibration import Calibration
-from controller.process import Frame, answers
+from controller.process import Frame, answers, inbox_of
 from controller.registry import load_law
 from plant_sim.scenario import Loaded, load
 from tools import record, setup
@@ -177,7 +177,7 @@ def _control(controller: node.Controller, state: int, run: int, counter: int) ->
     """RUN_CTRL to the controller between runs; returns the next counter."""
     word = put(RUN_CTRL.RunState, state) + put(RUN_CTRL.Iteration, run)
     payload = int(e2e.protect(word, counter, RUN_CTRL.data_id))
-    for _answer in answers(controller, [(RUN_CTRL.frame_id, payload)]):
+    for _answer in answers(controller, inbox_of(controller), [(RUN_CTRL.frame_id, payload)]):
         pass
     return int(e2e.next_counter(counter))
 
@@ -188,7 +188,7 @@ def _answered(controller: node.Controller, sensed: np.ndarray) -> np.ndarray:
     received: Iterator[Frame] = zip(
         sensed["frame_id"].tolist(), sensed["payload"].tolist(), strict=True
     )
-    for tick, sent in enumerate(answers(controller, received)):
+    for tick, sent in enumerate(answers(controller, inbox_of(controller), received)):
         frames += [(tick, frame_id, payload) for frame_id, payload in sent]
     return np.array(frames, FRAME)
 

@@ -8,22 +8,25 @@ plant or controller, or both, may be external: started by their owner, known by 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 
+from can_dbc import faults
 from can_dbc.bus import choose_bus, open_bus, recv_frames
 from controller import node
 from controller.calibration import Calibration
 from controller.interface import fault_names
 from controller.registry import is_file, load_law
 from plant_sim.scenario import FOLDER, Loaded, load, members
-from tools import hil, line, record, setup, sil
-from tools.files import write_json
+from tools import hil, line, record, setup, sil, sil_faults
+from tools.files import write_json, write_text
 from tools.frames import LineDigest
 from tools.hil import RunError
 from tools.lyapunov import has_lyapunov, lyapunov
@@ -72,6 +75,7 @@ class Options:
     trace: bool = True
     record: Path | None = None  # recording of the frames
     external: tuple[str, ...] = ()  # nodes that are not ours: plant, controller
+    faults: Path | None = None  # file of faults to inject
 
 
 @dataclass
@@ -86,14 +90,15 @@ class Session:
     listener: Listener
     summary: dict[str, Any] = field(default_factory=dict)
     recording: record.Recording | None = None
+    plan: faults.Plan | None = None  # of the faults of the bus
 
 
 def run(options: Options, listener: Listener) -> dict[str, Any]:
     """Runs the session; returns and writes the summary.
 
     Raises ScenarioError, LawError, CalibrationError, BusError, MemoryFileError, RecordError,
-    SessionError for bad input, RunError if a run ends early (the summary then holds the runs that
-    were completed and the reason), KeyboardInterrupt likewise.
+    FaultError, SessionError for bad input, RunError if a run ends early (the summary then holds the
+    runs that were completed and the reason), KeyboardInterrupt likewise.
     """
     loaded = load(options.scenario)
     trains = members(loaded)
@@ -104,9 +109,12 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
     if options.record is not None:
         record.check_target(options.record)
+    plan = None
+    if options.faults is not None:
+        plan = _fault_plan(options, options.faults, loaded)
     prepare(options.out)
     listener.begin(loaded, law, runs)
-    session = Session(options, loaded, trains, law, runs, listener)
+    session = Session(options, loaded, trains, law, runs, listener, plan=plan)
     session.summary = {
         "schema": SCHEMA,
         "scenario": loaded.name,
@@ -120,6 +128,8 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         "controller": {"state_bytes": 0, "memory_bytes": 0},
         "runs": [],
     }
+    if plan is not None:
+        session.summary["faults_injected"] = {}
     try:
         if options.mode == "hil":
             _run_hil(session, calibrations)
@@ -134,6 +144,24 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     finally:
         write_json(options.out / "summary.json", session.summary)
     return session.summary
+
+
+def _fault_plan(options: Options, file: Path, loaded: Loaded) -> faults.Plan:
+    """The faults of the bus that are asked for. Raises FaultError, SessionError."""
+    if options.external:
+        raise SessionError(f"{file}: faults are injected in nodes of ours, not in an external one")
+    if options.mode == "mil":
+        raise SessionError(f"{file}: faults need mode sil or hil, this is mil")
+    return faults.load(file, options.seed, loaded.scenario.period_s)
+
+
+def _save_injected(session: Session, events: Sequence[faults.Event]) -> None:
+    """The log of injected faults as a table, and how many of each kind in the summary."""
+    kinds = Counter(event.kind for event in events)
+    session.summary["faults_injected"] = dict(sorted(kinds.items()))
+    rows = [faults.Event.__struct_fields__, *(msgspec.structs.astuple(event) for event in events)]
+    lines = [",".join(str(cell) for cell in row) for row in rows]
+    write_text(session.options.out / "faults.csv", "\n".join(lines) + "\n")
 
 
 def _refuse_what_is_for_one_train(options: Options) -> None:
@@ -168,7 +196,7 @@ def prepare(out: Path) -> None:
     """An output folder without what an earlier session left. Raises SessionError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for name in ("summary.json", "trace.rrd"):
+        for name in ("summary.json", "trace.rrd", "faults.csv"):
             (out / name).unlink(missing_ok=True)
     except OSError as error:
         raise SessionError(f"{out}: cannot write there: {error.strerror}") from None
@@ -203,7 +231,7 @@ def _finish_run(
     frames: list[np.ndarray],
     truths: list[np.ndarray],
     seconds: float,
-    faults: list[list[str]],
+    latched: list[list[str]],
     frames_lost: int = 0,
 ) -> dict[str, Any]:
     """The row of a run, added to the summary and shown; a list has an entry for each train.
@@ -218,13 +246,13 @@ def _finish_run(
         **measured,
         "ticks_per_s": len(truths[0]) / seconds,
         "frames_lost": frames_lost,
-        "faults": faults[0],
+        "faults": latched[0],
     }
     if "trains" in measured:
         row["faults"] = [
-            f"train {train}: {name}" for train, names in enumerate(faults, 1) for name in names
+            f"train {train}: {name}" for train, names in enumerate(latched, 1) for name in names
         ]
-        for of_train, names in zip(measured["trains"], faults, strict=True):
+        for of_train, names in zip(measured["trains"], latched, strict=True):
             of_train["faults"] = names
     session.summary["runs"].append(row)
     session.listener.row(row)
@@ -239,7 +267,7 @@ def _set_digest(session: Session, digest: str, of_trains: list[str]) -> None:
 
 
 def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
-    options, loaded = session.options, session.loaded
+    options = session.options
     digest = LineDigest(len(calibrations))
     nodes = [node.build(calibration, options.memory) for calibration in calibrations]
     session.summary["controller"] = {
@@ -251,27 +279,41 @@ def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
         if options.trace:
             writer = _trace_writer(session)
             stack.callback(writer.close)
-        for results in sil.run_line(
-            loaded,
-            nodes,
-            runs=session.runs,
-            seed=options.seed,
-            progress=session.listener.progress,
-        ):
+        injected: list[faults.Event] = []
+        for results in _runs_in_process(session, nodes):
+            injected += faults.in_order([each for result in results for each in result.injected])
+            if session.plan is not None:
+                _save_injected(session, injected)
             frames = [result.frames for result in results]
             truths = [result.truth for result in results]
-            faults = [result.faults for result in results]
+            latched = [result.faults for result in results]
             digest.update(frames)
             _set_digest(session, digest.hex(), digest.of_trains())
             run, seconds = results[0].run, results[0].seconds
-            row = _finish_run(session, run, frames, truths, seconds, faults)
             if writer is not None:
-                for train, of_train in enumerate(frames):
-                    writer.frames(run, of_train, train)
+                for train, result in enumerate(results):
+                    writer.frames(run, result.frames, train)
+                    writer.faults(run, result.injected, train)
                 for table in (np.stack(truths), *_own_columns(session, frames, truths)):
                     for train, column in enumerate(table):
                         writer.truth(run, column, train)
+            if results[0].cut:
+                raise RunError(results[0].cut)
+            row = _finish_run(session, run, frames, truths, seconds, latched)
+            if writer is not None:
                 writer.run_summary(run, row)
+
+
+def _runs_in_process(
+    session: Session, nodes: list[node.Controller]
+) -> Iterator[list[sil.RunResult]]:
+    """The runs, with the faults that are asked for."""
+    loaded, seed, progress = session.loaded, session.options.seed, session.listener.progress
+    if session.plan is None:
+        return sil.run_line(loaded, nodes, runs=session.runs, seed=seed, progress=progress)
+    return sil_faults.run_line(
+        loaded, nodes, runs=session.runs, seed=seed, plan=session.plan, progress=progress
+    )
 
 
 def _own_columns(
@@ -350,6 +392,8 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
             _refuse_busy_bus(bus, BUSY_S / len(buses))
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, _recording(session):
         kept = Path(scratch)
+        if session.plan is not None:
+            faults.save(session.plan, kept)
         events = hil.run(
             scenario=loaded.source,
             controllers=calibrations,
@@ -361,6 +405,7 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
             recorder_arguments=_recorder_arguments(session, kept),
             external=options.external,
             cars=_cars(loaded),
+            faults=None if session.plan is None else kept,
         )
         try:
             with closing(events):  # whatever ends the session ends the nodes
@@ -368,6 +413,8 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
                     _on_event(session, bench, speaker.name, event, kept)
         finally:
             _record_the_rest(session, kept)
+            if session.plan is not None:
+                _save_injected(session, faults.injected(kept))
 
 
 def _record_the_rest(session: Session, kept: Path) -> None:
@@ -450,6 +497,6 @@ def _on_run(
             file = kept / f"columns_{run}_{number}.npy"
             np.save(file, table)
             tap.command(command="truth", run=run, file=str(file))
-    faults = [fault_names(bits) for bits in led["faults"]]
-    row = _finish_run(session, run, frames, truths, led["seconds"], faults, frames_lost)
+    latched = [fault_names(bits) for bits in led["faults"]]
+    row = _finish_run(session, run, frames, truths, led["seconds"], latched, frames_lost)
     tap.command(command="summary", run=run, row=row)

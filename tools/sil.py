@@ -8,7 +8,7 @@ frame is logged.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from can_dbc.codec import FORCE_CMD, MESSAGE_COUNT, MESSAGES
+from can_dbc.faults import Event
 from can_dbc.step import step
 from controller import node as controller_node
 from controller.calibration import Calibration
@@ -36,6 +37,8 @@ class RunResult:
     truth: np.ndarray  # [ticks] of plant.TRUTH
     faults: list[str]
     seconds: float
+    cut: str = ""  # why the run ended early
+    injected: Sequence[Event] = ()  # faults of the bus
 
 
 @step

@@ -48,6 +48,7 @@ from can_dbc.codec import (
     database,
     decode_column,
 )
+from can_dbc.faults import Event
 from controller.interface import fault_names
 from tools.frames import columns, estimate, physical
 
@@ -411,6 +412,15 @@ class TraceWriter:
         """Log an event; `level` is one of Rerun's: INFO, WARN, ERROR, CRITICAL."""
         content = self._rr.TextLog.columns(text=[message], level=[level])
         self._send("events" + self._branch(train), self._index(np.array([tick]), run), content)
+
+    def faults(self, run: int, events: Sequence[Event], train: int = 0) -> None:
+        """Log the faults that were injected in a run."""
+        if not events:
+            return
+        texts = [f"injected at the {e.node}: {e.kind} of {e.message} {e.n}" for e in events]
+        content = self._rr.TextLog.columns(text=texts, level=["WARN"] * len(texts))
+        ticks = np.array([event.tick for event in events])
+        self._send("events" + self._branch(train), self._index(ticks, run), content)
 
     def close(self) -> None:
         """Write everything out, with the footer that makes the file complete.

@@ -1,0 +1,84 @@
+"""The way from the bus into a node's mailboxes.
+
+A mailbox holds one frame. Of two frames of one message in the same tick, the one that follows in
+sequence stays, and the other is counted as refused: neither noise nor a repeated or foreign frame
+can push out what the node waits for.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from can_dbc import e2e
+from can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGE_COUNT, MESSAGES
+from can_dbc.faults import Receiver
+
+
+def intact(message: Any, payload: int) -> bool:
+    """Whether CRC and Data-ID of a payload are those of `message`."""
+    return bool(e2e.check(payload, -1, message.data_id) == e2e.OK)
+
+
+def follows(message: Any, payload: int, counter: int) -> bool:
+    """Whether an intact payload is the next after that with `counter`, -1 for none."""
+    return bool(e2e.check(payload, counter, message.data_id) == e2e.OK)
+
+
+class Inbox:
+    """Received frames into mailboxes; the faults of the session, if there are any, come between."""
+
+    def __init__(
+        self, mailboxes: np.ndarray, counters: np.ndarray, faults: Receiver | None = None
+    ) -> None:
+        """Views of the node's own: it clears `fresh` after each tick.
+
+        :param mailboxes: [MESSAGE_COUNT] of codec.MAILBOX.
+        :param counters: [MESSAGE_COUNT], end-to-end counter of the last good frame, -1: none.
+        """
+        self._payloads, self._fresh = mailboxes["payload"], mailboxes["fresh"]
+        self._counters = counters
+        self._faults = faults
+        self.refused = np.zeros(MESSAGE_COUNT, np.int64)  # frames that were one too many in a tick
+
+    def take(self, can_id: int, payload: int) -> None:
+        """A frame that has come from the bus."""
+        if self._faults is None:
+            self.put(can_id, payload)
+            return
+        for frame in self._faults.deliver(can_id, payload):
+            self.put(*frame)
+
+    def close_tick(self) -> None:
+        """Nothing more comes in this tick."""
+        if self._faults is not None:
+            for frame in self._faults.close_tick():
+                self.put(*frame)
+
+    def begin_run(self, run: int) -> None:
+        """Before the first frame of a run."""
+        self.refused.fill(0)
+        if self._faults is not None:
+            self._faults.begin(run)
+
+    def end_run(self) -> None:
+        """After the last frame of a run."""
+        if self._faults is not None:
+            self._faults.end()
+
+    def put(self, can_id: int, payload: int) -> None:
+        """A frame into its mailbox, as it is."""
+        index = INDEX_OF_FRAME_ID.get(can_id)
+        if index is None:
+            return
+        if self._fresh[index]:
+            message = MESSAGES[index]
+            waiting = int(self._payloads[index])
+            if not (intact(message, waiting) and follows(message, payload, waiting >> 8 & 15)):
+                self.refused[index] += 1
+                waited_for = follows(message, waiting, int(self._counters[index]))
+                if waited_for or not intact(message, payload):
+                    return
+        self._payloads[index] = payload
+        self._fresh[index] = 1
