@@ -25,7 +25,7 @@ from controller.calibration import Calibration
 from controller.interface import fault_names
 from controller.registry import is_file, load_law
 from plant_sim.scenario import FOLDER, Loaded, load, members
-from tools import hil, line, record, setup, sil, sil_faults
+from tools import environment, hil, line, record, setup, sil, sil_faults
 from tools.files import write_json, write_text
 from tools.frames import LineDigest
 from tools.hil import RunError
@@ -124,9 +124,13 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         "external": list(options.external),
         "pace": "lockstep",
         "seed": options.seed,
+        "scenario_digest": loaded.digest,
         "digest": "",
         "controller": {"state_bytes": 0, "memory_bytes": 0},
         "runs": [],
+        "versions": environment.versions(),
+        "machine": environment.machine(),
+        "configuration": environment.configuration(loaded),
     }
     if plan is not None:
         session.summary["faults_injected"] = {}
