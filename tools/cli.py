@@ -58,6 +58,14 @@ class Pace(StrEnum):
     lockstep = "lockstep"
 
 
+class Picture(StrEnum):
+    """How a figure is stored."""
+
+    png = "png"
+    svg = "svg"
+    pdf = "pdf"
+
+
 # Column of the table: heading, key of the row, factor, format.
 COLUMNS = (
     ("run", "run", 1, "{:d}"),
@@ -618,6 +626,53 @@ def claims(
     surprises = [row.text for row in rows if row.holds != row.expected]
     if surprises:
         raise _fail(f"otherwise than found before: {'; '.join(surprises)}", EXIT_BAD_INPUT)
+
+
+@app.command()
+def figures(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Folders of `ato-hil run`, all of one paper."),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the pictures; DIR/figures by default.")
+    ] = None,
+    formats: Annotated[
+        list[Picture] | None,
+        typer.Option("--format", help="May be given several times; png and svg by default."),
+    ] = None,
+) -> None:
+    """Draw a paper's figures from runs, with what the paper states."""
+    from tools.figures import draw
+    from tools.figures.folder import read
+
+    kinds = [kind.value for kind in formats or (Picture.png, Picture.svg)]
+    target = out or folders[0] / "figures"
+    files = []
+    with one_line_for_bad_input():
+        for drawn in draw.figures([read(folder) for folder in folders]):
+            if drawn.figure is None:
+                console.print(f"{drawn.stem}: not drawn: {drawn.why_not}", soft_wrap=True)
+                continue
+            files += draw.write(drawn, target, kinds)
+            console.print(f"{drawn.stem}: {drawn.drawing.caption}", soft_wrap=True)
+    if not files:
+        raise _fail("nothing could be drawn", EXIT_BAD_INPUT)
+    console.print(f"{len(files)} files in {target}", soft_wrap=True)
+
+
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of `ato-hil run`.")],
+    out: Annotated[Path | None, typer.Option(help="HTML file; DIR/report.html by default.")] = None,
+) -> None:
+    """Write one HTML page of a run: configuration, tables, figures, digests, versions."""
+    from tools import report as page
+
+    target = out or folder / "report.html"
+    with one_line_for_bad_input():
+        page.write(folder, target)
+    console.print(f"report  {target}", soft_wrap=True)
 
 
 @app.command("bus-report")

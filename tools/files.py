@@ -8,11 +8,16 @@ from pathlib import Path
 from typing import Any
 
 
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file. Raises OSError, and leaves what was there."""
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes a file. Raises OSError, and leaves what was there."""
     temporary = path.with_name(f"{path.name}.new")
-    temporary.write_text(text, encoding="utf-8")
+    temporary.write_bytes(content)
     os.replace(temporary, path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file, likewise."""
+    write_bytes(path, text.encode())
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -39,6 +39,12 @@ class Silent:
 
 
 @pytest.fixture(scope="session")
+def silent() -> Silent:
+    """A listener for sessions that no one watches."""
+    return Silent()
+
+
+@pytest.fixture(scope="session")
 def short_text() -> str:
     """A scenario of 2001 ticks and two runs, as TOML."""
     return SHORT
