@@ -1,4 +1,5 @@
-"""AUTOSAR E2E Profile 11 in integers: CRC-8 and counter over the mailbox word.
+"""AUTOSAR E2E Profile 11 in integers: CRC-8 and counter over the mailbox word, and the state
+machine of a receiver.
 
 Byte 0 is the CRC, byte 1 the counter (low nibble, 0..14) and the Data-ID nibble (bits 8 to 11 of
 the Data-ID). The CRC is SAE J1850 (polynomial 0x1D) with initial value and final XOR 0, over the
@@ -7,6 +8,19 @@ the `autosar-e2e` package.
 
 A CRC with initial value 0 is linear: it is the XOR of one table entry a byte, so all look-ups are
 independent.
+
+A receiver (`receive`) checks once a tick, also when nothing came: the check says what became of
+one frame, the state machine what the last WINDOW checks make of the link (AUTOSAR PRS E2E Protocol,
+E2E_P11Check and E2E_SMCheck with one window size; NODATA is left without counting, as there).
+
+    NODATA   until the first frame whose CRC fits
+    INIT     until enough good frames (VALID) or too many corrupt ones (INVALID)
+    VALID    until too few good or too many corrupt frames are in the window (INVALID)
+    INVALID  until enough good and few enough corrupt frames are in the window (VALID)
+
+Good are OK and LOST. A repeated frame, one out of sequence and none count neither way; they leave
+less room for good ones. One thing is not as there: the first frame is OK whatever its counter, so
+that a receiver may start in the middle.
 """
 
 from __future__ import annotations
@@ -23,9 +37,52 @@ COUNTER_PERIOD = 15  # the counter runs 0..14
 # What a receiver finds in one frame.
 OK = 0
 REPEATED = 1  # same counter as the last good frame
-LOST = 2  # counter jumped: frames are missing or out of order
+LOST = 2  # counter jumped as far as allowed: frames are missing before this one
 CORRUPT = 3  # CRC or Data-ID nibble wrong
 NONE = 4  # no new frame
+WRONG_SEQUENCE = 5  # counter jumped further than allowed, or back
+
+DELTA_ANY = COUNTER_PERIOD - 1  # a jump of the counter that is never too far
+DELTA_MAX = 4  # MaxDeltaCounter: a larger one finds fewer old frames that come again
+
+# States of a link.
+NODATA, INIT, VALID, INVALID = 0, 1, 2, 3
+
+WINDOW = 16  # WindowSize, checks
+AGE_MAX = 1 << 20  # ticks, where the age of a link stops
+
+# What a receiver tolerates: MaxDeltaCounter, and MinOkState... and MaxErrorState... of the state
+# machine.
+SETTING = np.dtype(
+    [
+        ("delta_max", np.int32),
+        ("init_ok_min", np.int32),  # good frames that make a link VALID
+        ("init_error_max", np.int32),  # corrupt ones that it may have had
+        ("valid_ok_min", np.int32),  # fewer good frames in the window make it INVALID
+        ("valid_error_max", np.int32),  # more corrupt ones likewise
+        ("invalid_ok_min", np.int32),  # what makes it VALID again
+        ("invalid_error_max", np.int32),
+        ("padding", np.int32),
+    ],
+    align=True,
+)
+
+# A message as its receiver knows it.
+LINK = np.dtype(
+    [
+        ("counter", np.int32),  # of the last frame whose CRC fitted, -1: none yet
+        ("age", np.int32),  # ticks since the last good frame
+        ("lost", np.int32),  # frames refused, and gaps, in this run
+        ("check", np.int32),  # OK .. WRONG_SEQUENCE: what the last check found
+        ("state", np.int32),  # NODATA .. INVALID
+        ("ok_count", np.int32),  # good checks in the window
+        ("error_count", np.int32),  # corrupt ones
+        ("ok_window", np.int32),  # a bit a check, the newest lowest
+        ("error_window", np.int32),
+        ("padding", np.int32),
+    ],
+    align=True,
+)
 
 
 def _crc_table() -> np.ndarray:
@@ -92,18 +149,107 @@ def send(node: Any, tx: Any, message: Any, word: Any) -> None:
 
 @step
 def check(word: Any, last_counter: Any, data_id: Any) -> Any:
-    """OK, REPEATED, LOST or CORRUPT; `last_counter` is that of the last good frame, -1 if there
-    was none."""
+    """OK, REPEATED, LOST or CORRUPT, for who has no bound for jumps of the counter; `last_counter`
+    is that of the last good frame, -1 if there was none."""
+    return verdict(word, last_counter, data_id, DELTA_ANY)
+
+
+@step
+def verdict(word: Any, last_counter: Any, data_id: Any, delta_max: Any) -> Any:
+    """OK, REPEATED, LOST, WRONG_SEQUENCE or CORRUPT; `last_counter` is that of the last frame whose
+    CRC fitted, -1 if there was none; the counter may jump by `delta_max`."""
     found = word & 0xFF
     counter = (word >> 8) & 15
     nibble = (word >> 12) & 15
     expected = crc(word, int64(_CRC_DATA_ID[data_id & 0xFF]))
     if found != expected or nibble != ((data_id >> 8) & 15) or counter >= COUNTER_PERIOD:
-        return CORRUPT
-    if last_counter < 0:
-        return OK
-    if counter == last_counter:
-        return REPEATED
-    if counter != next_counter(last_counter):
-        return LOST
-    return OK
+        return int64(CORRUPT)
+    delta = counter - last_counter
+    if delta < 0:
+        delta += COUNTER_PERIOD
+    if last_counter < 0 or delta == 1:
+        return int64(OK)
+    if delta == 0:
+        return int64(REPEATED)
+    if delta > delta_max:
+        return int64(WRONG_SEQUENCE)
+    return int64(LOST)
+
+
+@step
+def is_good(found: Any) -> Any:
+    """1 if the check found a frame whose value counts."""
+    if found == OK:
+        return int64(1)
+    return int64(1) if found == LOST else int64(0)
+
+
+@step
+def begin_link(link: Any) -> None:
+    """Nothing received yet: a run starts."""
+    link.counter = -1
+    link.age = 0
+    link.lost = 0
+    link.check = NONE
+    link.state = NODATA
+    link.ok_count = 0
+    link.error_count = 0
+    link.ok_window = 0
+    link.error_window = 0
+
+
+@step
+def receive(setting: Any, link: Any, mailbox: Any, data_id: Any) -> Any:
+    """1 if the mailbox holds a new frame whose value counts; once a tick, frame or not."""
+    found = int64(NONE)
+    if int64(mailbox.fresh) != 0:
+        word = int64(mailbox.payload)
+        found = verdict(word, int64(link.counter), data_id, int64(setting.delta_max))
+        if found != CORRUPT:
+            link.counter = (word >> 8) & 15
+        if found != OK:
+            link.lost = int64(link.lost) + 1
+    good = is_good(found)
+    link.age = int64(0) if good != 0 else min(int64(link.age) + 1, int64(AGE_MAX))
+    link.check = found
+    supervise(setting, link, found)
+    return good
+
+
+@step
+def age(link: Any) -> Any:
+    """Ticks since the last good frame; as old as can be if the link is INVALID."""
+    return int64(AGE_MAX) if int64(link.state) == INVALID else int64(link.age)
+
+
+@step
+def supervise(setting: Any, link: Any, found: Any) -> None:
+    """The state machine of a link, one check further."""
+    state = int64(link.state)
+    if state == NODATA:
+        if found != CORRUPT and found != NONE:
+            link.state = INIT
+        return
+    count(link, is_good(found), int64(1) if found == CORRUPT else int64(0))
+    good, bad = int64(link.ok_count), int64(link.error_count)
+    if state == INIT:
+        if bad > int64(setting.init_error_max):
+            link.state = INVALID
+        elif good >= int64(setting.init_ok_min):
+            link.state = VALID
+    elif state == VALID:
+        if bad > int64(setting.valid_error_max) or good < int64(setting.valid_ok_min):
+            link.state = INVALID
+    elif bad <= int64(setting.invalid_error_max) and good >= int64(setting.invalid_ok_min):
+        link.state = VALID
+
+
+@step
+def count(link: Any, good: Any, bad: Any) -> None:
+    """The window one check further: the oldest check leaves it."""
+    window = int64(link.ok_window)
+    link.ok_count = int64(link.ok_count) + good - ((window >> (WINDOW - 1)) & 1)
+    link.ok_window = ((window << 1) | good) & ((1 << WINDOW) - 1)
+    window = int64(link.error_window)
+    link.error_count = int64(link.error_count) + bad - ((window >> (WINDOW - 1)) & 1)
+    link.error_window = ((window << 1) | bad) & ((1 << WINDOW) - 1)

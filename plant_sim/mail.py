@@ -14,9 +14,11 @@ def received(node: Any, rx: Any, message: Any) -> Any:
     if int64(rx[message.index].fresh) == 0:
         return int64(0)
     word = int64(rx[message.index].payload)
-    found = e2e.check(word, int64(node.received[message.index]), message.data_id)
-    if found == e2e.CORRUPT or found == e2e.REPEATED:
+    last = int64(node.received[message.index])
+    found = e2e.verdict(word, last, message.data_id, e2e.DELTA_MAX)
+    if found != e2e.CORRUPT:
+        node.received[message.index] = (word >> 8) & 15
+    if e2e.is_good(found) == 0:
         node.refused += 1
         return int64(0)
-    node.received[message.index] = (word >> 8) & 15
     return int64(1)

@@ -209,9 +209,22 @@ def test_a_repeated_frame_is_refused_and_a_gap_is_not():
     rig.receive(FORCE_CMD, counter=3, Force=5000.0)
     rig.advance()
     assert (rig.force(), rig.node["refused"]) == (1000.0, 1)
-    rig.receive(FORCE_CMD, counter=9, Force=5000.0)
+    rig.receive(FORCE_CMD, counter=3 + e2e.DELTA_MAX, Force=5000.0)
     rig.advance()
     assert (rig.force(), rig.node["refused"]) == (5000.0, 1)
+
+
+def test_a_frame_out_of_sequence_is_refused_and_the_next_is_not():
+    rig = Rig()
+    rig.receive(FORCE_CMD, counter=3, Force=1000.0)
+    rig.advance()
+    for counter in (3 + e2e.DELTA_MAX + 1, 2):  # too far ahead, then back
+        rig.receive(FORCE_CMD, counter=counter, Force=5000.0)
+        rig.advance()
+    assert (rig.force(), rig.node["refused"]) == (1000.0, 2)
+    rig.receive(FORCE_CMD, counter=3, Force=5000.0)
+    rig.advance()
+    assert (rig.force(), rig.node["refused"]) == (5000.0, 2)
 
 
 def test_cars_are_obeyed_one_by_one_and_the_total_is_not():
