@@ -18,6 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from can_dbc import e2e
 from controller import (
     distribution,
     firmware,
@@ -25,15 +26,19 @@ from controller import (
     guard,
     memory,
     neighbours,
+    plausibility,
     rebasing,
     reference,
 )
-from controller.q import Q_ACCELERATION, Q_FORCE, Q_SPEED
+from controller.q import INT32_MAX, INT32_MIN, Q_ACCELERATION, Q_FORCE, Q_POSITION, Q_SPEED
 from controller.quantise import CalibrationError, Recall, Vehicle, fixed
 from controller.registry import law_label, law_number, load_law
 
 FORMAT = "ato-hil calibration 1"
 AGE_MAX_TICKS = 1000
+AHEAD_MAX_TICKS = 10_000
+# A message that comes every 100 ms may be as much older.
+SLOW_TICKS = 20
 
 
 class MemorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -46,12 +51,38 @@ class MemorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     storage: str = "int32"  # int32 | int16
 
 
+class PlausibleSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the guard believes of the sensors: more than any train does."""
+
+    speed_max_m_s: float = 127.0  # either way
+    speed_jump_m_s: float = 0.5  # what noise may add from one sample to the next
+    acceleration_max_m_s2: float = 5.0
+    position_margin_m: float = 10_000.0  # before the start and beyond the end of the timetable
+    position_jump_m: float = 1.0  # what noise may add
+    progress_max_m: float = 0.5  # of the position against the sum of the speed
+    window_s: float = 2.0  # over which they are compared
+
+
 class GuardSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the guard tolerates and how it brakes."""
+    """What the guard tolerates and how it brakes; none turns a limit off."""
 
     age_max_ticks: int = 10
+    counter_jump_max: int = e2e.DELTA_MAX  # MaxDeltaCounter of the end-to-end check
     service_brake_m_s2: float = 0.8
+    emergency_brake_m_s2: float = 1.2
+    hold_brake_m_s2: float | None = None  # at standstill, while the timetable stands
+    standstill_m_s: float = 0.02
     overspeed_margin_m_s: float = 2 / 3.6  # above the permitted speed, before traction is cut
+    brake_margin_m_s: float | None = None  # before the service brake comes on
+    emergency_margin_m_s: float | None = None  # before an emergency request
+    cut_ahead_s: float = 0.0  # look-ahead towards ATP's target: traction is cut
+    brake_ahead_s: float = 0.0  # the service brake comes on
+    target_brake_m_s2: float | None = None  # counted on towards it; none: the service brake
+    traction_max_m_s2: float | None = None  # of the command, as specific force
+    brake_max_m_s2: float | None = None
+    jerk_max_m_s3: float | None = None  # of the command; brakes of the guard have none
+    acceleration_max_m_s2: float | None = None  # measured: above it the command does not grow
+    plausible: PlausibleSettings = PlausibleSettings()
 
 
 @dataclass(frozen=True)
@@ -107,7 +138,12 @@ def calibrate(
     except (msgspec.ValidationError, CalibrationError) as error:
         raise CalibrationError(f"laws.{law_label(law)}: {error}") from None
     params["gradient_map"] = gradient_map.calibrate(map_sections)
-    params["guard"] = _guard(guard_settings)
+    params["guard"] = _guard(guard_settings, vehicle.period_s)
+    start_m = line.start_m if line else 0.0
+    params["plausibility"] = _plausibility(
+        guard_settings.plausible, vehicle.period_s, start_m, length_m(profile)
+    )
+    params["every_tick"], params["slow"] = _links(guard_settings)
     ticks = int(profile["ticks"].sum()) + 1
     if recall is not None:
         preview_ticks = recall.ahead_ticks
@@ -131,18 +167,107 @@ def calibrate(
     return Calibration(law, scenario_digest, params, profile, memory_settings.storage)
 
 
-def _guard(settings: GuardSettings) -> np.ndarray:
+def _guard(settings: GuardSettings, period_s: float) -> np.ndarray:
     params = np.zeros(1, guard.PARAMS)
     age = _whole("control.guard.age_max_ticks", settings.age_max_ticks, 1, AGE_MAX_TICKS)
     params["age_max"] = age
-    params["control_age_max"] = age + 20
-    params["service_brake"] = fixed(
-        "control.guard.service_brake_m_s2", -abs(settings.service_brake_m_s2), Q_ACCELERATION
-    )
-    params["overspeed_margin"] = fixed(
-        "control.guard.overspeed_margin_m_s", settings.overspeed_margin_m_s, Q_SPEED
+    params["control_age_max"] = age + SLOW_TICKS
+    target_brake = settings.target_brake_m_s2
+    if target_brake is None:
+        target_brake = settings.service_brake_m_s2
+    emergency_brake = max(settings.emergency_brake_m_s2, settings.service_brake_m_s2, key=abs)
+    for name, value, q, off in (
+        ("service_brake", _below(settings.service_brake_m_s2), Q_ACCELERATION, 0),
+        ("emergency_brake", _below(emergency_brake), Q_ACCELERATION, 0),
+        ("hold_brake", _below(settings.hold_brake_m_s2), Q_ACCELERATION, 0),
+        ("standstill", settings.standstill_m_s, Q_SPEED, 0),
+        ("overspeed_margin", settings.overspeed_margin_m_s, Q_SPEED, INT32_MAX),
+        ("brake_margin", settings.brake_margin_m_s, Q_SPEED, INT32_MAX),
+        ("emergency_margin", settings.emergency_margin_m_s, Q_SPEED, INT32_MAX),
+        ("target_brake", abs(target_brake), Q_ACCELERATION, 0),
+        ("traction_max", settings.traction_max_m_s2, Q_ACCELERATION, INT32_MAX),
+        ("brake_max", _below(settings.brake_max_m_s2), Q_ACCELERATION, INT32_MIN),
+        ("acceleration_max", settings.acceleration_max_m_s2, Q_ACCELERATION, INT32_MAX),
+        ("period", period_s, 30, 0),
+    ):
+        key = f"control.guard.{name}{UNITS.get(q, '')}"
+        params[name] = off if value is None else fixed(key, value, q, 28 if q == 30 else 32)
+    for name, ahead_s in (
+        ("cut_ahead", settings.cut_ahead_s),
+        ("brake_ahead", settings.brake_ahead_s),
+    ):
+        ticks = round(ahead_s / period_s)
+        params[name] = _whole(f"control.guard.{name}_s in ticks", ticks, 0, AHEAD_MAX_TICKS)
+    jerk = settings.jerk_max_m_s3
+    params["force_step"] = (
+        2**32
+        if jerk is None
+        else fixed("control.guard.jerk_max_m_s3", jerk * period_s, Q_ACCELERATION)
     )
     return params
+
+
+# Ends of the scenario's keys, by the format of their numbers.
+UNITS = {Q_ACCELERATION: "_m_s2", Q_SPEED: "_m_s"}
+
+
+def _below(value: float | None) -> float | None:
+    """A brake is negative, whatever sign the scenario gives it."""
+    return None if value is None else -abs(value)
+
+
+def _plausibility(
+    settings: PlausibleSettings, period_s: float, start_m: float, distance_m: float
+) -> np.ndarray:
+    """PARAMS for a timetable that starts at `start_m` and is `distance_m` long."""
+    params = np.zeros(1, plausibility.PARAMS)
+    where = "control.guard.plausible."
+    margin = settings.position_margin_m
+    low, high = start_m - margin, start_m + distance_m + margin
+    for name, key, value, q in (
+        ("speed_min", "speed_max_m_s", -settings.speed_max_m_s, Q_SPEED),
+        ("speed_max", "speed_max_m_s", settings.speed_max_m_s, Q_SPEED),
+        ("speed_jump", "speed_jump_m_s", settings.speed_jump_m_s, Q_SPEED),
+        ("speed_step", "acceleration_max_m_s2", settings.acceleration_max_m_s2 * period_s, Q_SPEED),
+        ("position_jump", "position_jump_m", settings.position_jump_m, Q_POSITION),
+        ("position_step", "speed_max_m_s", settings.speed_max_m_s * period_s, Q_POSITION),
+        ("progress_max", "progress_max_m", settings.progress_max_m, Q_POSITION),
+        ("period", "period_s", period_s, 30),
+    ):
+        if value < 0 and name != "speed_min":
+            raise CalibrationError(f"{where}{key} is {value:g}, expected 0 or more")
+        params[name] = fixed(f"{where}{key}", value, q, 28 if q == 30 else 32)
+    # Beyond what the firmware holds the sensor's own range is the limit.
+    for name, limit in (("position_min", low), ("position_max", high)):
+        params[name] = min(max(round(limit * 2**Q_POSITION), INT32_MIN), INT32_MAX)
+    window = round(settings.window_s / period_s)
+    params["window"] = _whole(f"{where}window_s in ticks", window, 1, AGE_MAX_TICKS)
+    return params
+
+
+def length_m(profile: np.ndarray) -> float:
+    """Length of a reference profile, [n] of reference.SEGMENT: the recursion of `reference.py` over
+    a whole segment."""
+    x = v = a = 0
+    for ticks, jerk in zip(profile["ticks"].tolist(), profile["jerk"].tolist(), strict=True):
+        x += 3 * ticks * v + 3 * ticks**2 * a + ticks**3 * jerk
+        v += 2 * ticks * a + ticks**2 * jerk
+        a += ticks * jerk
+    return float(x / 2**40)
+
+
+def _links(settings: GuardSettings) -> tuple[np.ndarray, np.ndarray]:
+    """What the receivers tolerate: of messages that come every tick, and of those every 100 ms.
+
+    A link that gets a frame now and then stays young but is no longer valid; one that misses frames
+    for less than the largest age stays valid.
+    """
+    jump = _whole("control.guard.counter_jump_max", settings.counter_jump_max, 1, e2e.DELTA_ANY)
+    few = max(min(3, e2e.WINDOW - 2 - settings.age_max_ticks), 0)
+    every_tick, slow = np.zeros(1, e2e.SETTING), np.zeros(1, e2e.SETTING)
+    every_tick[0] = (jump, max(few, 1), 2, few, 4, 12, 0, 0)
+    slow[0] = (jump, 1, 1, 0, 1, 1, 0, 0)
+    return every_tick, slow
 
 
 def _line(params: np.ndarray, line: Line, period_s: float) -> None:

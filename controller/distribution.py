@@ -9,7 +9,8 @@ which loses 47 % of the traction.
 
 With growing |u| the cars reach their limits in an order that does not depend on the data.
 Calibration therefore removes the car at its limit and solves again, car by car, and writes a row
-for each solution. Beyond the last row all cars are at their limits: the sum saturates.
+for each solution. Beyond the last row all cars are at their limits: the sum saturates, and
+`distribute` says at what.
 
 Contract: forces in N, Q4; finds one row and applies it, the same operations for all data. While the
 cars can give u, |Upsilon F - u| is at most half an LSB times mu_k a car: below 2 LSB for the
@@ -47,6 +48,7 @@ PARAMS = np.dtype(
     [
         ("cars", np.int32),  # cars that get a force of their own, 0: none, the total alone is sent
         ("padding", np.int32),
+        ("most", np.int64, (2,)),  # largest |u| that the cars can give, N Q4; TRACTION, BRAKING
         ("rows", ROW, (2, ROWS)),  # TRACTION, BRAKING; by ascending edge, the last one repeated
     ],
     align=True,
@@ -82,10 +84,10 @@ def calibrate(
     braking = _limits("brake_max_n", brake_max_n, cars)
     params = np.zeros(1, PARAMS)
     params["cars"] = cars
-    params["rows"][0, TRACTION] = _rows(
-        [value if k + 1 in motor_cars else 0.0 for k, value in enumerate(mu)], traction
-    )
-    params["rows"][0, BRAKING] = _rows(mu, braking)
+    driven = [value if k + 1 in motor_cars else 0.0 for k, value in enumerate(mu)]
+    for side, part, limits in ((TRACTION, driven, traction), (BRAKING, mu, braking)):
+        params["rows"][0, side] = _rows(part, limits)
+        params["most"][0, side] = int(sum(m * most for m, most in zip(part, limits, strict=True)))
     return params
 
 
@@ -124,8 +126,9 @@ def _rows(mu: list[float], limits: list[int]) -> np.ndarray:
 
 
 @step
-def distribute(params: Any, force: Any, car_force: Any) -> None:
-    """car_force[k] for the total force, both N Q4; nothing if no car gets a force of its own."""
+def distribute(params: Any, force: Any, car_force: Any) -> Any:
+    """car_force[k] for the total force, both N Q4, nothing if no car gets a force of its own; the
+    total that the cars give."""
     if int64(params.cars) > 0:
         side = TRACTION if force > 0 else BRAKING
         magnitude = abs(int64(force))
@@ -139,3 +142,6 @@ def distribute(params: Any, force: Any, car_force: Any) -> None:
             share = int64(params.rows[side, found].share[k])
             given = sat32(round_shift(start + share * beyond, SHARE_Q))
             car_force[k] = given if force > 0 else -given
+        most = int64(params.most[side])
+        return min(int64(force), most) if force > 0 else max(int64(force), -most)
+    return int64(force)

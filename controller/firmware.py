@@ -47,6 +47,7 @@ from controller import (
     guard,
     memory,
     neighbours,
+    plausibility,
     rebasing,
     reference,
 )
@@ -56,14 +57,18 @@ from controller.interface import (
     BEHIND,
     BRAKE,
     COAST,
+    EMERGENCY_REQUEST,
     ENDED,
     ESTIMATES_MAX,
     FAULT_LINE_EMERGENCY,
     FAULT_NEIGHBOUR_LOST,
     FAULT_REBASED,
     FAULT_TICK,
+    GUARD_EMERGENCY,
+    GUARD_HOLD,
     GUARD_NORMAL,
     GUARD_SERVICE_BRAKE,
+    HOLD,
     IDLE,
     INPUTS,
     OUTPUTS,
@@ -84,6 +89,7 @@ TICK_MASK = 0xFFFF
 
 # From raw signals to the firmware's formats; the scales are the DBC's.
 _SPEED_SHIFT = Q_SPEED - binary_exponent(TRAIN_SPEED, "Speed")
+_ACCELERATION_SHIFT = Q_ACCELERATION - binary_exponent(TRAIN_SPEED, "Acceleration")
 _POSITION_SHIFT = Q_POSITION - binary_exponent(TRAIN_POSITION, "Position")
 _FORCE_SHIFT = Q_FORCE - binary_exponent(FORCE_CMD, "Force")
 _POSITION_ERROR_SHIFT = Q_POSITION - binary_exponent(ATO_TRACKING, "PositionError")
@@ -92,16 +98,9 @@ _RADIO_OFFSET_SHIFT = rebasing.Q_OFFSET - binary_exponent(ATO_RADIO, "Offset")
 _RADIO_OFFSET_SPEED_SHIFT = rebasing.Q_OFFSET_SPEED - binary_exponent(ATO_RADIO, "OffsetSpeed")
 # A hundredth has no exact Q24: 14 more bits keep the limit within an LSB.
 _PERMITTED_FACTOR = round(ATP_LIMIT.PermittedSpeed.scale * 2 ** (Q_SPEED + 14))
+_TARGET_FACTOR = round(ATP_LIMIT.TargetSpeed.scale * 2 ** (Q_SPEED + 14))
 
-LINK = np.dtype(
-    [
-        ("counter", np.int32),  # of the last good frame received, -1: none yet
-        ("age", np.int32),  # ticks since then
-        ("lost", np.int32),  # frames refused or missed in this run
-        ("padding", np.int32),
-    ],
-    align=True,
-)
+LINK = e2e.LINK
 
 CORE_PARAMS = np.dtype(
     [
@@ -122,10 +121,8 @@ CORE_STATE = np.dtype(
         ("faults", np.int32),  # latched until the next run
         ("guard", np.int32),
         ("force", np.int32),  # total force sent, N Q4
-        ("permitted_speed", np.int32),  # Q24
-        ("supervision", np.int32),
-        ("quality", np.int32),
         ("map_section", np.int32),  # of the gradient map
+        ("padding", np.int32),
         ("car_force", np.int32, (distribution.CARS_MAX,)),  # N Q4
         # Next end-to-end counter of each message sent; an even number, so that nothing is padded.
         ("sent", np.int32, (MESSAGE_COUNT + MESSAGE_COUNT % 2,)),
@@ -139,7 +136,10 @@ def params_dtype(law_params: np.dtype) -> np.dtype:
     return np.dtype(
         [
             ("core", CORE_PARAMS),
+            ("every_tick", e2e.SETTING),  # receiver of messages that come every tick
+            ("slow", e2e.SETTING),  # of the others
             ("guard", guard.PARAMS),
+            ("plausibility", plausibility.PARAMS),
             ("reference", reference.REFERENCE_PARAMS),
             ("gradient_map", gradient_map.PARAMS),
             ("neighbours", neighbours.PARAMS),
@@ -158,6 +158,9 @@ def state_dtype(law_state: np.dtype) -> np.dtype:
         [
             ("core", CORE_STATE),
             ("links", LINK, (MESSAGE_COUNT,)),
+            ("seen", guard.SEEN),
+            ("guard", guard.STATE),
+            ("plausibility", plausibility.STATE),
             ("cursor", reference.CURSOR),
             ("ahead", reference.CURSOR),
             ("neighbours", neighbours.STATE),
@@ -173,25 +176,6 @@ def state_dtype(law_state: np.dtype) -> np.dtype:
 
 
 @step
-def receive(link: Any, mailbox: Any, data_id: Any) -> Any:
-    """1 if the mailbox holds a new frame that passes the end-to-end check; keeps the link's
-    counter and age."""
-    link.age = min(int64(link.age) + 1, int64(1) << 20)
-    if int64(mailbox.fresh) == 0:
-        return int64(0)
-    word = int64(mailbox.payload)
-    found = e2e.check(word, int64(link.counter), data_id)
-    if found == e2e.CORRUPT or found == e2e.REPEATED:
-        link.lost = int64(link.lost) + 1
-        return int64(0)
-    if found == e2e.LOST:
-        link.lost = int64(link.lost) + 1
-    link.counter = (word >> 8) & 15
-    link.age = 0
-    return int64(1)
-
-
-@step
 def begin(params: Any, profile: Any, state: Any, cells: Any) -> None:
     """State of a new run: reference at its start, counters at 0, no fault; the learning memory
     stays."""
@@ -200,15 +184,12 @@ def begin(params: Any, profile: Any, state: Any, cells: Any) -> None:
     core.faults = 0
     core.guard = GUARD_NORMAL
     core.force = 0
-    core.permitted_speed = 0
-    core.supervision = 0
-    core.quality = 0
     core.map_section = 0
     for i in range(MESSAGE_COUNT):
         core.sent[i] = 0
-        state.links[i].counter = -1
-        state.links[i].age = 0
-        state.links[i].lost = 0
+        e2e.begin_link(state.links[i])
+    guard.begin(state.seen, state.guard)
+    plausibility.begin(state.plausibility)
     reference.rewind(state.cursor, profile)
     reference.rewind(state.ahead, profile)
     for i in range(reference.PREVIEW_MAX):
@@ -247,25 +228,51 @@ def tracking_word(inputs: Any) -> Any:
 
 
 @step
-def read_inputs(state: Any, rx: Any) -> None:
+def receive(setting: Any, state: Any, rx: Any, message: Any) -> Any:
+    """1 if the message has come and its value counts."""
+    return e2e.receive(setting, state.links[message.index], rx[message.index], message.data_id)
+
+
+@step
+def read_inputs(params: Any, state: Any, rx: Any) -> None:
     """Measurements, limit and tick from the mailboxes that pass their check; the others keep their
     last value."""
     core = state.core
     inputs = state.inputs
-    if receive(state.links[TRAIN_SPEED.index], rx[TRAIN_SPEED.index], TRAIN_SPEED.data_id):
+    seen = state.seen
+    speed_is_new = receive(params.every_tick, state, rx, TRAIN_SPEED)
+    if speed_is_new != 0:
         word = int64(rx[TRAIN_SPEED.index].payload)
         inputs.speed = get(word, TRAIN_SPEED.Speed) << _SPEED_SHIFT
-        core.quality = get(word, TRAIN_SPEED.Quality)
-    if receive(state.links[TRAIN_POSITION.index], rx[TRAIN_POSITION.index], TRAIN_POSITION.data_id):
+        seen.acceleration = get(word, TRAIN_SPEED.Acceleration) << _ACCELERATION_SHIFT
+        seen.quality = get(word, TRAIN_SPEED.Quality)
+    position_is_new = receive(params.every_tick, state, rx, TRAIN_POSITION)
+    if position_is_new != 0:
         word = int64(rx[TRAIN_POSITION.index].payload)
         inputs.position = get(word, TRAIN_POSITION.Position) << _POSITION_SHIFT
         if get(word, TRAIN_POSITION.Tick) != (int64(core.tick) & TICK_MASK):
             core.faults = int64(core.faults) | FAULT_TICK
-    if receive(state.links[ATP_LIMIT.index], rx[ATP_LIMIT.index], ATP_LIMIT.data_id):
+    if receive(params.every_tick, state, rx, ATP_LIMIT) != 0:
         word = int64(rx[ATP_LIMIT.index].payload)
         permitted = get(word, ATP_LIMIT.PermittedSpeed) * _PERMITTED_FACTOR
-        core.permitted_speed = sat32(round_shift(permitted, 14))
-        core.supervision = get(word, ATP_LIMIT.Supervision)
+        seen.permitted_speed = sat32(round_shift(permitted, 14))
+        target = get(word, ATP_LIMIT.TargetSpeed) * _TARGET_FACTOR
+        seen.target_speed = sat32(round_shift(target, 14))
+        seen.target_distance = get(word, ATP_LIMIT.TargetDistance)
+        seen.supervision = get(word, ATP_LIMIT.Supervision)
+    seen.speed = inputs.speed
+    seen.speed_age = e2e.age(state.links[TRAIN_SPEED.index])
+    seen.position_age = e2e.age(state.links[TRAIN_POSITION.index])
+    seen.limit_age = e2e.age(state.links[ATP_LIMIT.index])
+    seen.control_age = e2e.age(state.links[RUN_CTRL.index])
+    core.faults = int64(core.faults) | plausibility.faults_of_samples(
+        params.plausibility,
+        state.plausibility,
+        int64(inputs.speed),
+        speed_is_new,
+        int64(inputs.position),
+        position_is_new,
+    )
 
 
 @step
@@ -283,9 +290,15 @@ def read_reference(params: Any, state: Any) -> None:
 
 @step
 def read_neighbour(params: Any, state: Any, rx: Any, side: Any, position: Any, motion: Any) -> None:
-    """The two frames of a neighbour, if both of this tick pass their check."""
-    passed = receive(state.links[position.index], rx[position.index], position.data_id)
-    passed &= receive(state.links[motion.index], rx[motion.index], motion.data_id)
+    """The two frames of a neighbour, if both of this tick pass their check and neither link is
+    invalid."""
+    passed = receive(params.slow, state, rx, position)
+    passed &= receive(params.slow, state, rx, motion)
+    if (
+        int64(state.links[position.index].state) == e2e.INVALID
+        or int64(state.links[motion.index].state) == e2e.INVALID
+    ):
+        passed = int64(0)
     if passed != 0 and int64(params.neighbours.exists[side]) != 0:
         neighbours.accept(
             params.neighbours,
@@ -386,6 +399,20 @@ def car_words(core: Any, tx: Any, cars: Any) -> None:
 
 
 @step
+def mode_of(reaction: Any, force: Any) -> Any:
+    """Mode of FORCE_CMD: what the guard asks for, else the sign of the force."""
+    if reaction == GUARD_EMERGENCY:
+        return int64(EMERGENCY_REQUEST)
+    if reaction == GUARD_HOLD:
+        return int64(HOLD)
+    if force > 0:
+        return int64(TRACTION)
+    if force < 0:
+        return int64(BRAKE)
+    return int64(COAST)
+
+
+@step
 def estimate_word(index: Any, exponent: Any, value: Any) -> Any:
     """ATO_ESTIMATE; the multiplexed signals share one place."""
     return (
@@ -414,6 +441,8 @@ def build_tick(law_step: Any) -> Any:
         if has_neighbours:
             core.faults = int64(core.faults) | read_line(params, state, rx)
         read_map(params, state)
+        stands = int64(inputs.reference_speed) == 0 and int64(inputs.ahead_speed) == 0
+        state.seen.timetable_stands = 1 if stands else 0
 
         memory.gather(params.memory, state.memory, cells, state.cell)
         law_step(params.law, state.law, state.cell, inputs, state.outputs)
@@ -422,30 +451,19 @@ def build_tick(law_step: Any) -> Any:
         faults = (
             int64(core.faults)
             | int64(state.outputs.status)
-            | guard.faults_of_inputs(
-                params.guard,
-                int64(state.links[TRAIN_SPEED.index].age),
-                int64(state.links[TRAIN_POSITION.index].age),
-                int64(state.links[ATP_LIMIT.index].age),
-                int64(state.links[RUN_CTRL.index].age),
-                int64(core.quality),
-            )
-            | guard.faults_of_motion(
-                int64(inputs.speed), int64(core.permitted_speed), int64(core.supervision)
-            )
+            | guard.faults_of_inputs(params.guard, state.seen)
+            | guard.faults_of_motion(params.guard, state.seen)
         )
         core.faults = faults
-        core.guard = guard.state_of(
-            params.guard, faults, int64(inputs.speed), int64(core.permitted_speed)
-        )
+        core.guard = guard.state_of(params.guard, state.guard, state.seen, faults)
         wanted = int64(state.outputs.force)
-        specific = guard.limited(params.guard, int64(core.guard), wanted)
-        force = round_shift(specific * int64(params.core.mass), Q_ACCELERATION)
-        raw = saturate(FORCE_CMD.Force, force >> _FORCE_SHIFT)
-        force = raw << _FORCE_SHIFT
-        inputs.limited = 1 if specific != wanted else 0
+        specific = guard.limited(params.guard, state.guard, state.seen, int64(core.guard), wanted)
+        asked = round_shift(specific * int64(params.core.mass), Q_ACCELERATION) >> _FORCE_SHIFT
+        force = saturate(FORCE_CMD.Force, asked) << _FORCE_SHIFT
+        force = distribution.distribute(params.distribution, force, core.car_force)
+        raw = force >> _FORCE_SHIFT
+        inputs.limited = 1 if specific != wanted or raw != asked else 0
         core.force = force
-        distribution.distribute(params.distribution, force, core.car_force)
 
         tick = int64(core.tick)
         car_words(core, tx, int64(params.distribution.cars))
@@ -466,17 +484,12 @@ def build_tick(law_step: Any) -> Any:
             )
         if has_neighbours and phase == 0:
             e2e.send(core, tx, ATO_RADIO, radio_word(state))
-        mode = int64(COAST)
-        if force > 0:
-            mode = int64(TRACTION)
-        if force < 0:
-            mode = int64(BRAKE)
         e2e.send(
             core,
             tx,
             FORCE_CMD,
             put(FORCE_CMD.Force, raw)
-            + put(FORCE_CMD.Mode, mode)
+            + put(FORCE_CMD.Mode, mode_of(int64(core.guard), force))
             + put(FORCE_CMD.Tick, tick & TICK_MASK),
         )
         reference.advance(params.reference, state.cursor, profile)
@@ -488,7 +501,7 @@ def build_tick(law_step: Any) -> Any:
         params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any, period: Any
     ) -> None:
         core = state.core
-        if receive(state.links[RUN_CTRL.index], rx[RUN_CTRL.index], RUN_CTRL.data_id):
+        if receive(params.slow, state, rx, RUN_CTRL) != 0:
             word = int64(rx[RUN_CTRL.index].payload)
             wanted = get(word, RUN_CTRL.RunState)
             if wanted > ENDED:
@@ -505,7 +518,7 @@ def build_tick(law_step: Any) -> Any:
                     begin(params, profile, state, cells)
                 e2e.send(core, tx, ATO_STATUS, status_word(params, core))
         if int64(core.run_state) == RUNNING and period == 1:
-            read_inputs(state, rx)
+            read_inputs(params, state, rx)
             run_tick(params, profile, state, cells, rx, tx)
 
     return tick

@@ -1,7 +1,30 @@
 """The guard: what may not happen whatever the law says. Integer comparisons that read as sentences.
 
-Contract: reads the checked inputs of this tick, limits the force, says why; never raises the
-force; bounded time.
+Contract: reads what was received and checked in this tick (SEEN) and the fault bits, limits the
+law's force, says what it does and why; bounded time. Its reactions only ever lower the force:
+`limited` lets pass min(law, reaction). Limits of comfort (range and jerk of the command, which a
+scenario may set) may hold a law's brake back, but never a brake of the guard.
+
+REACTIONS says which fault leads to what. A reaction to a fault stays until the next run begins.
+Besides, by the speed of now:
+
+    too fast by overspeed_margin, or for the target within cut_ahead     no traction, while it is so
+    too fast by brake_margin, or for the target within brake_ahead       service brake, until the
+                                                                         speed is permitted again
+    too fast by emergency_margin, or ATP demands an emergency brake      emergency request, until
+                                                                         the train stands
+    the timetable stands and the train does                              hold brake, while it is so
+
+The target is ATP's: v_t at a distance d. With v and s the speed reached and the way passed in a
+time of look-ahead, if the present acceleration lasts, it is too fast if v^2 - v_t^2 > 2 b (d - s).
+FORCE_CMD then says: Mode hold or emergency_request, else coast, traction or brake by its sign.
+
+Bounds, in ticks from the cause to the FORCE_CMD with the reaction (`reaction_ticks` gives them as
+numbers): a message that no longer comes, age_max + 1 after its last good frame (RUN_CTRL:
+control_age_max + 1); one that is corrupt more often than its link's state machine tolerates, no
+later than that; what a frame itself says (speed, supervision, quality, an implausible value), 0:
+the FORCE_CMD of the tick that received it. Position and speed that disagree: as in
+`plausibility.py`.
 """
 
 from __future__ import annotations
@@ -13,85 +36,287 @@ import numpy as np
 from can_dbc.step import int64, step
 from controller.interface import (
     FAULT_ATP,
+    FAULT_BARRIER,
     FAULT_CONTROL_LOST,
     FAULT_LIMIT_LOST,
+    FAULT_LINE_EMERGENCY,
+    FAULT_NEIGHBOUR_LOST,
     FAULT_OVERSPEED,
+    FAULT_POSITION_IMPLAUSIBLE,
     FAULT_POSITION_LOST,
+    FAULT_PROGRESS,
+    FAULT_REBASED,
     FAULT_SENSOR,
+    FAULT_SPEED_IMPLAUSIBLE,
     FAULT_SPEED_LOST,
+    FAULT_TARGET,
+    FAULT_TICK,
     GUARD_COAST,
+    GUARD_EMERGENCY,
+    GUARD_HOLD,
     GUARD_NORMAL,
     GUARD_SERVICE_BRAKE,
 )
+from controller.q import clamp, sat32
+
+# What the guard does about a fault until the next run begins; normal: it is reported, no more.
+REACTIONS = {
+    FAULT_SPEED_LOST: GUARD_SERVICE_BRAKE,
+    FAULT_POSITION_LOST: GUARD_SERVICE_BRAKE,
+    FAULT_LIMIT_LOST: GUARD_SERVICE_BRAKE,
+    FAULT_CONTROL_LOST: GUARD_SERVICE_BRAKE,
+    FAULT_SENSOR: GUARD_SERVICE_BRAKE,
+    FAULT_SPEED_IMPLAUSIBLE: GUARD_SERVICE_BRAKE,
+    FAULT_POSITION_IMPLAUSIBLE: GUARD_SERVICE_BRAKE,
+    FAULT_PROGRESS: GUARD_SERVICE_BRAKE,
+    FAULT_ATP: GUARD_SERVICE_BRAKE,  # and an emergency request first, if ATP demands that
+    FAULT_OVERSPEED: GUARD_NORMAL,  # what is done goes by the speed of now, as above
+    FAULT_TARGET: GUARD_NORMAL,  # likewise
+    FAULT_TICK: GUARD_NORMAL,  # ages tell whether frames are missing
+    FAULT_BARRIER: GUARD_NORMAL,
+    FAULT_NEIGHBOUR_LOST: GUARD_NORMAL,  # the law does without it
+    FAULT_REBASED: GUARD_NORMAL,
+    FAULT_LINE_EMERGENCY: GUARD_NORMAL,  # the re-based timetable brakes
+}
+FAULTS_THAT_BRAKE = sum(
+    fault for fault, reaction in REACTIONS.items() if reaction == GUARD_SERVICE_BRAKE
+)
+
+# Supervision and Quality, as in ATP_LIMIT and TRAIN_SPEED.
+ATP_SERVICE_BRAKE, ATP_EMERGENCY_BRAKE = 2, 3
+SENSOR_INVALID = 2
+NO_TARGET = 65535  # TargetDistance of ATP_LIMIT
 
 PARAMS = np.dtype(
     [
+        ("force_step", np.int64),  # change of the command in a tick, m/s^2, Q27; 2^32: any
         ("age_max", np.int32),  # ticks without a valid frame after which a 10 ms message is lost
         ("control_age_max", np.int32),  # the same for RUN_CTRL, which comes every 100 ms
         ("service_brake", np.int32),  # specific force of the service brake, m/s^2, Q27, negative
+        ("emergency_brake", np.int32),  # the same of an emergency request
+        ("hold_brake", np.int32),  # the same at standstill; 0: none
+        ("standstill", np.int32),  # m/s, Q24: up to here the train stands
         ("overspeed_margin", np.int32),  # above the permitted speed, m/s, Q24: traction is cut
+        ("brake_margin", np.int32),  # likewise: the service brake comes on
+        ("emergency_margin", np.int32),  # likewise: an emergency request
+        ("cut_ahead", np.int32),  # look-ahead before traction is cut, ticks
+        ("brake_ahead", np.int32),  # before the service brake comes on, ticks
+        ("target_brake", np.int32),  # deceleration counted on towards a target, m/s^2, Q27
+        ("traction_max", np.int32),  # largest command, m/s^2, Q27
+        ("brake_max", np.int32),  # least, negative
+        ("acceleration_max", np.int32),  # m/s^2, Q27: above it the command does not grow
+        ("period", np.int32),  # Ts, s, Q30, below 2^27
     ],
     align=True,
 )
 
-# Why the run may not go on as the law wants: brake until the run ends.
-FAULTS_THAT_BRAKE = (
-    FAULT_SPEED_LOST
-    | FAULT_POSITION_LOST
-    | FAULT_LIMIT_LOST
-    | FAULT_CONTROL_LOST
-    | FAULT_SENSOR
-    | FAULT_ATP
+# What the guard looks at in a tick: as received, or held.
+SEEN = np.dtype(
+    [
+        ("speed_age", np.int32),  # ticks since the last good frame of TRAIN_SPEED
+        ("position_age", np.int32),  # of TRAIN_POSITION
+        ("limit_age", np.int32),  # of ATP_LIMIT
+        ("control_age", np.int32),  # of RUN_CTRL
+        ("speed", np.int32),  # m/s, Q24
+        ("acceleration", np.int32),  # m/s^2, Q27
+        ("quality", np.int32),  # of the speed sensor
+        ("permitted_speed", np.int32),  # m/s, Q24
+        ("target_speed", np.int32),  # m/s, Q24
+        ("target_distance", np.int32),  # m, NO_TARGET: none
+        ("supervision", np.int32),  # what ATP demands
+        ("timetable_stands", np.int32),  # 1: now and as far as it is previewed
+    ],
+    align=True,
+)
+
+STATE = np.dtype(
+    [
+        ("emergency", np.int32),  # 1: an emergency request, until the train stands
+        ("braking", np.int32),  # 1: service brake, until the speed is permitted again
+        ("force", np.int32),  # what was let pass in the last tick, m/s^2, Q27
+        ("padding", np.int32),
+    ],
+    align=True,
 )
 
 
+def reaction_ticks(params: Any) -> dict[int, int]:
+    """The bounds: ticks from the cause to the FORCE_CMD with the reaction, by fault bit, of the
+    faults that brake and have one of their own; `params` one record of PARAMS."""
+    ticks = {fault: 0 for fault, reaction in REACTIONS.items() if reaction == GUARD_SERVICE_BRAKE}
+    del ticks[FAULT_PROGRESS]
+    for fault in (FAULT_SPEED_LOST, FAULT_POSITION_LOST, FAULT_LIMIT_LOST):
+        ticks[fault] = int(params["age_max"]) + 1
+    ticks[FAULT_CONTROL_LOST] = int(params["control_age_max"]) + 1
+    return ticks
+
+
 @step
-def faults_of_inputs(
-    params: Any, speed_age: Any, position_age: Any, limit_age: Any, control_age: Any, quality: Any
-) -> Any:
-    """Fault bits of messages that are too old and of the sensor's own report; ages in ticks."""
+def begin(seen: Any, state: Any) -> None:
+    """Nothing seen, nothing latched: a run starts."""
+    seen.speed = 0
+    seen.acceleration = 0
+    seen.quality = 0
+    seen.permitted_speed = 0
+    seen.target_speed = 0
+    seen.target_distance = NO_TARGET
+    seen.supervision = 0
+    state.emergency = 0
+    state.braking = 0
+    state.force = 0
+
+
+# Faults.
+
+
+@step
+def faults_of_inputs(params: Any, seen: Any) -> Any:
+    """Fault bits of messages that are too old and of the sensor's own report."""
     faults = int64(0)
-    if speed_age > int64(params.age_max):
+    if int64(seen.speed_age) > int64(params.age_max):
         faults |= FAULT_SPEED_LOST
-    if position_age > int64(params.age_max):
+    if int64(seen.position_age) > int64(params.age_max):
         faults |= FAULT_POSITION_LOST
-    if limit_age > int64(params.age_max):
+    if int64(seen.limit_age) > int64(params.age_max):
         faults |= FAULT_LIMIT_LOST
-    if control_age > int64(params.control_age_max):
+    if int64(seen.control_age) > int64(params.control_age_max):
         faults |= FAULT_CONTROL_LOST
-    if quality == 2:
+    if int64(seen.quality) == SENSOR_INVALID:
         faults |= FAULT_SENSOR
     return faults
 
 
 @step
-def faults_of_motion(speed: Any, permitted_speed: Any, supervision: Any) -> Any:
-    """Fault bits of overspeed and of what ATP demands; speeds Q24."""
+def faults_of_motion(params: Any, seen: Any) -> Any:
+    """Fault bits of overspeed, from the first LSB, of a target that needs a brake, and of what ATP
+    demands."""
     faults = int64(0)
-    if speed > permitted_speed:
+    if int64(seen.speed) > int64(seen.permitted_speed):
         faults |= FAULT_OVERSPEED
-    if supervision >= 2:
+    if is_too_fast_for_target(params, seen, int64(params.brake_ahead)) != 0:
+        faults |= FAULT_TARGET
+    if int64(seen.supervision) >= ATP_SERVICE_BRAKE:
         faults |= FAULT_ATP
     return faults
 
 
-@step
-def state_of(params: Any, faults: Any, speed: Any, permitted_speed: Any) -> Any:
-    """What the guard does about the latched faults, and about the speed of now; speeds Q24.
+# Speed.
 
-    Overspeed is reported from the first LSB; traction is cut while it is above the margin."""
-    if faults & FAULTS_THAT_BRAKE:
+
+@step
+def is_above(seen: Any, margin: Any) -> Any:
+    """1 if the speed is above the permitted one by more than `margin`, Q24."""
+    above = int64(seen.speed) - int64(seen.permitted_speed)
+    return int64(1) if above > margin else int64(0)
+
+
+@step
+def speed_ahead(params: Any, seen: Any, ticks: Any) -> Any:
+    """Speed in so many ticks if the present acceleration lasts, Q24; a deceleration does not
+    count."""
+    gain = (max(int64(seen.acceleration), int64(0)) * int64(params.period)) >> 30  # Q27 a tick
+    return sat32(int64(seen.speed) + ((gain * ticks) >> 3))
+
+
+@step
+def is_too_fast_for_target(params: Any, seen: Any, ticks: Any) -> Any:
+    """1 if the speed in so many ticks needs more than the deceleration counted on to be the
+    target's where the target is; an old ATP_LIMIT looks further ahead."""
+    if int64(seen.target_distance) == NO_TARGET:
+        return int64(0)
+    ahead = ticks + int64(seen.limit_age)  # below 2^22
+    speed = speed_ahead(params, seen, ahead)
+    target_speed = int64(seen.target_speed)
+    if speed <= target_speed:
+        return int64(0)
+    way = (((speed * int64(params.period)) >> 30) * ahead) >> 16  # m, Q8, below 2^35
+    left = (int64(seen.target_distance) << 8) - way
+    brake = int64(params.target_brake) >> 11  # Q16
+    # Q12 squared against Q16 * Q8: below 2^39 and 2^58.
+    squares = (speed >> 12) * (speed >> 12) - (target_speed >> 12) * (target_speed >> 12)
+    return int64(1) if squares > 2 * brake * left else int64(0)
+
+
+@step
+def stands(params: Any, seen: Any) -> Any:
+    """1 if the train stands."""
+    return int64(1) if abs(int64(seen.speed)) <= int64(params.standstill) else int64(0)
+
+
+@step
+def must_cut(params: Any, seen: Any) -> Any:
+    """1 if there may be no traction."""
+    return is_above(seen, int64(params.overspeed_margin)) | is_too_fast_for_target(
+        params, seen, int64(params.cut_ahead)
+    )
+
+
+@step
+def must_brake(params: Any, seen: Any) -> Any:
+    """1 if the service brake has to come on."""
+    return is_above(seen, int64(params.brake_margin)) | is_too_fast_for_target(
+        params, seen, int64(params.brake_ahead)
+    )
+
+
+# What is done.
+
+
+@step
+def latch(params: Any, state: Any, seen: Any) -> None:
+    """Emergency request and service brake by the speed of now: when they begin and end."""
+    demanded = int64(seen.supervision) >= ATP_EMERGENCY_BRAKE
+    if demanded or is_above(seen, int64(params.emergency_margin)) != 0:
+        state.emergency = 1
+    elif stands(params, seen) != 0:
+        state.emergency = 0
+    if must_brake(params, seen) != 0:
+        state.braking = 1
+    elif is_above(seen, int64(0)) == 0 and must_cut(params, seen) == 0:
+        state.braking = 0
+
+
+@step
+def state_of(params: Any, state: Any, seen: Any, faults: Any) -> Any:
+    """What the guard does, about the latched faults and about the speed of now; once a tick."""
+    latch(params, state, seen)
+    if int64(state.emergency) != 0:
+        return int64(GUARD_EMERGENCY)
+    if (faults & FAULTS_THAT_BRAKE) != 0 or int64(state.braking) != 0:
         return int64(GUARD_SERVICE_BRAKE)
-    if speed > permitted_speed + int64(params.overspeed_margin):
+    if must_cut(params, seen) != 0:
         return int64(GUARD_COAST)
+    wanted = int64(params.hold_brake) != 0 and int64(seen.timetable_stands) != 0
+    if wanted and stands(params, seen) != 0:
+        return int64(GUARD_HOLD)
     return int64(GUARD_NORMAL)
 
 
 @step
-def limited(params: Any, state: Any, force: Any) -> Any:
-    """The force that the guard lets pass, Q27: the law's, no traction, or the service brake."""
-    if state == GUARD_NORMAL:
-        return force
-    if state == GUARD_COAST:
-        return min(force, int64(0))
-    return min(force, int64(params.service_brake))
+def comfortable(params: Any, state: Any, seen: Any, force: Any) -> Any:
+    """The law's force within range and jerk, Q27; above the largest acceleration it does not
+    grow."""
+    last = int64(state.force)
+    force = clamp(force, int64(params.brake_max), int64(params.traction_max))
+    if int64(seen.acceleration) > int64(params.acceleration_max):
+        force = min(force, last)
+    return clamp(force, last - int64(params.force_step), last + int64(params.force_step))
+
+
+@step
+def limited(params: Any, state: Any, seen: Any, reaction: Any, force: Any) -> Any:
+    """The force that the guard lets pass, Q27, for what `state_of` said and the law wants; once a
+    tick."""
+    if reaction == GUARD_EMERGENCY:
+        force = min(force, int64(params.emergency_brake))
+    elif reaction == GUARD_SERVICE_BRAKE:
+        force = min(force, int64(params.service_brake))
+    elif reaction == GUARD_COAST:
+        force = min(comfortable(params, state, seen, force), int64(0))
+    elif reaction == GUARD_HOLD:
+        force = min(force, int64(params.hold_brake))
+    else:
+        force = comfortable(params, state, seen, force)
+    # A hold brake goes at once: what it held with is not where the jerk of a start begins.
+    state.force = int64(0) if reaction == GUARD_HOLD else force
+    return force

@@ -68,6 +68,10 @@ FAULT_BARRIER = 1 << 8  # the law left the region that its barrier guards
 FAULT_NEIGHBOUR_LOST = 1 << 9  # nothing new from a neighbour for too long
 FAULT_REBASED = 1 << 10  # the train has left its timetable for a re-based one
 FAULT_LINE_EMERGENCY = 1 << 11  # a train of the line brakes in an emergency
+FAULT_SPEED_IMPLAUSIBLE = 1 << 12  # measured speed out of range, or jumped
+FAULT_POSITION_IMPLAUSIBLE = 1 << 13  # measured position likewise
+FAULT_PROGRESS = 1 << 14  # the position does not move as the speed says
+FAULT_TARGET = 1 << 15  # too fast for the target ahead
 
 FAULTS: dict[int, str] = {
     FAULT_SPEED_LOST: "speed lost",
@@ -82,11 +86,15 @@ FAULTS: dict[int, str] = {
     FAULT_NEIGHBOUR_LOST: "neighbour lost",
     FAULT_REBASED: "timetable re-based",
     FAULT_LINE_EMERGENCY: "emergency brake on the line",
+    FAULT_SPEED_IMPLAUSIBLE: "speed implausible",
+    FAULT_POSITION_IMPLAUSIBLE: "position implausible",
+    FAULT_PROGRESS: "position and speed disagree",
+    FAULT_TARGET: "too fast for the target",
 }
 
 # A run with one of these leaves no trace in the learning memory. A law that reaches its barrier or
 # the permitted speed still learns: that is how it comes to keep them.
-FAULTS_THAT_BLOCK_LEARNING = sum(FAULTS) - FAULT_BARRIER - FAULT_OVERSPEED
+FAULTS_THAT_BLOCK_LEARNING = sum(FAULTS) - FAULT_BARRIER - FAULT_OVERSPEED - FAULT_TARGET
 
 
 def fault_names(bits: int) -> list[str]:

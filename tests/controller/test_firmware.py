@@ -24,16 +24,18 @@ from can_dbc.codec import (
     RUN_CTRL,
     TRAIN_POSITION,
     TRAIN_SPEED,
+    database,
     get,
     mailboxes,
     put,
 )
-from controller import calibration, firmware, node, store
-from controller.calibration import GuardSettings, Line, MemorySettings
+from controller import calibration, distribution, firmware, guard, node, store
+from controller.calibration import GuardSettings, Line, MemorySettings, PlausibleSettings
 from controller.interface import (
     ARMED,
     BRAKE,
     COAST,
+    EMERGENCY_REQUEST,
     ENDED,
     FAULT_ATP,
     FAULT_CONTROL_LOST,
@@ -41,14 +43,22 @@ from controller.interface import (
     FAULT_LINE_EMERGENCY,
     FAULT_NEIGHBOUR_LOST,
     FAULT_OVERSPEED,
+    FAULT_POSITION_IMPLAUSIBLE,
     FAULT_POSITION_LOST,
+    FAULT_PROGRESS,
     FAULT_REBASED,
     FAULT_SENSOR,
+    FAULT_SPEED_IMPLAUSIBLE,
     FAULT_SPEED_LOST,
+    FAULT_TARGET,
     FAULT_TICK,
+    FAULTS,
     GUARD_COAST,
+    GUARD_EMERGENCY,
+    GUARD_HOLD,
     GUARD_NORMAL,
     GUARD_SERVICE_BRAKE,
+    HOLD,
     IDLE,
     RUNNING,
     TRACTION,
@@ -66,10 +76,18 @@ MARGIN_M_S = 0.5
 # One tick at rest, two seconds to 1.36 m/s, two back.
 JERK = 250_000
 PROFILE = np.array([(1, 0), (100, JERK), (200, -JERK), (100, JERK)], SEGMENT)
+# Tests put the train where they need it.
+ANY_MOTION = PlausibleSettings(
+    speed_max_m_s=127.99,
+    speed_jump_m_s=127.99,
+    position_margin_m=60_000.0,
+    position_jump_m=60_000.0,
+    progress_max_m=60_000.0,
+)
 GAINS = {"kp": 1e5, "kD": 0.0, "gp": 3e5, "gI": 0.0, "gD": 0.0}
 
 
-def calibrated(line=None):
+def calibrated(line=None, guard_settings=None):
     """A law that learns, two cars, previewed reference."""
     return calibration.calibrate(
         law="pdilc",
@@ -78,8 +96,12 @@ def calibrated(line=None):
         profile=PROFILE,
         preview_ticks=PREVIEW,
         memory_settings=MemorySettings(decimation=4),
-        guard_settings=GuardSettings(
-            age_max_ticks=AGE_MAX, service_brake_m_s2=0.5, overspeed_margin_m_s=MARGIN_M_S
+        guard_settings=guard_settings
+        or GuardSettings(
+            age_max_ticks=AGE_MAX,
+            service_brake_m_s2=0.5,
+            overspeed_margin_m_s=MARGIN_M_S,
+            plausible=ANY_MOTION,
         ),
         car_effectiveness=[1.0, 1.0, 1.0],
         motor_cars=[1, 3],
@@ -169,7 +191,13 @@ class Bench:
             self.put(RUN_CTRL, RunState=RUNNING, Iteration=1)
         if ATP_LIMIT not in without:
             supervision = signals.get("supervision", 0)
-            self.put(ATP_LIMIT, PermittedSpeed=round(permitted * 100), Supervision=supervision)
+            self.put(
+                ATP_LIMIT,
+                PermittedSpeed=round(permitted * 100),
+                TargetSpeed=round(signals.get("target", 0.0) * 100),
+                TargetDistance=signals.get("distance", guard.NO_TARGET),
+                Supervision=supervision,
+            )
         if TRAIN_SPEED not in without:
             raw = round(speed / TRAIN_SPEED.Speed.scale)
             self.put(TRAIN_SPEED, Speed=raw, Quality=signals.get("quality", 0))
@@ -266,7 +294,8 @@ def test_a_new_run_starts_anew(running):
     assert running.core["faults"]
     running.start(iteration=2)
     assert (running.core["faults"], running.core["guard"]) == (0, GUARD_NORMAL)
-    assert running.link(TRAIN_SPEED).tolist() == (-1, 0, 0, 0)
+    link = running.link(TRAIN_SPEED)
+    assert (link["counter"], link["age"], link["lost"], link["state"]) == (-1, 0, 0, e2e.NODATA)
     assert running.core["iteration"] == 2
     running.run_tick()
     assert running.inputs["reference_position"] == 0
@@ -434,6 +463,43 @@ def test_after_a_gap_the_new_frame_counts_and_the_gap_too(running):
     assert running.link(TRAIN_SPEED)["lost"] == 1
 
 
+def test_a_frame_out_of_sequence_is_refused(running):
+    for _ in range(8):
+        running.run_tick(speed=0.5)
+    old = (running.counters[TRAIN_SPEED.index] - 5) % 15
+    running.put(TRAIN_SPEED, counter=old, Speed=1000)
+    running.run_tick(without=[TRAIN_SPEED])
+    assert running.link(TRAIN_SPEED)["check"] == e2e.WRONG_SEQUENCE
+    assert running.inputs["speed"] == 1 << 23
+    assert running.link(TRAIN_SPEED)["lost"] == 1
+
+
+@pytest.mark.parametrize(("message", "fault"), LINKS, ids=lambda v: getattr(v, "name", ""))
+def test_a_message_that_comes_now_and_then_is_lost_however_young(running, message, fault):
+    """One frame in six: 2 or 3 of the last 16, never older than 5 ticks."""
+    for tick in range(60):
+        absent = () if tick % 6 == 0 else (message,)
+        running.run_tick(without=absent)
+        assert running.link(message)["age"] <= AGE_MAX
+    assert running.core["faults"] == fault
+    assert running.core["guard"] == GUARD_SERVICE_BRAKE
+
+
+@pytest.mark.parametrize(("message", "fault"), LINKS, ids=lambda v: getattr(v, "name", ""))
+def test_a_message_that_is_often_damaged_is_lost_however_young(running, message, fault):
+    """Every second frame; five corrupt ones in the window are too many."""
+    for tick in range(10):
+        running.run_tick(without=[message] if tick % 2 else ())
+        assert running.core["faults"] == 0
+        if tick % 2 == 0:
+            continue
+    for tick in range(10):
+        if tick % 2:
+            running.put_word(message, 1)
+        running.run_tick(without=[message] if tick % 2 else ())
+        assert (running.core["faults"] == fault) == (tick >= 9)
+
+
 def test_a_frame_of_another_message_is_refused(running):
     word = put(TRAIN_SPEED.Speed, 1000)
     counter = running.counters[TRAIN_SPEED.index]
@@ -497,6 +563,136 @@ def test_an_invalid_sensor_brakes_the_train(running):
     assert running.core["guard"] == GUARD_NORMAL
     running.run_tick(quality=2)
     assert running.core["faults"] == FAULT_SENSOR
+
+
+def test_an_emergency_request_lasts_until_the_train_stands(running):
+    sent = running.run_tick(speed=5.0, supervision=3)
+    assert get(sent[FORCE_CMD.name], FORCE_CMD.Mode) == EMERGENCY_REQUEST
+    assert get(sent[FORCE_CMD.name], FORCE_CMD.Force) / 16 <= -1.2 * MASS_KG
+    sent = running.run_tick(speed=0.03)
+    assert get(sent[FORCE_CMD.name], FORCE_CMD.Force) / 16 == pytest.approx(-1.2 * MASS_KG, abs=1)
+    assert get(sent[FORCE_CMD.name], FORCE_CMD.Mode) == EMERGENCY_REQUEST
+    assert running.core["guard"] == GUARD_EMERGENCY
+    sent = running.run_tick(speed=0.0)
+    assert get(sent[FORCE_CMD.name], FORCE_CMD.Mode) == BRAKE
+    assert running.core["guard"] == GUARD_SERVICE_BRAKE
+    assert running.core["faults"] == FAULT_ATP
+
+
+def test_every_fault_has_its_reaction_in_the_time_that_the_guard_states(built, adjusted):
+    adjusted("plausibility", speed_min=-(100 << 24))
+    bounds = guard.reaction_ticks(built.params[0]["guard"])
+    causes = {
+        FAULT_SPEED_LOST: {"without": [TRAIN_SPEED]},
+        FAULT_POSITION_LOST: {"without": [TRAIN_POSITION]},
+        FAULT_LIMIT_LOST: {"without": [ATP_LIMIT]},
+        FAULT_CONTROL_LOST: {"without": [RUN_CTRL]},
+        FAULT_SENSOR: {"quality": 2},
+        FAULT_ATP: {"supervision": 2},
+        FAULT_SPEED_IMPLAUSIBLE: {"speed": -127.5},
+        FAULT_POSITION_IMPLAUSIBLE: {"position": 65_500.0},
+    }
+    assert set(causes) == set(bounds)
+    for fault, cause in causes.items():
+        bench = Bench(built)
+        bench.start()
+        for _ in range(21):  # RUN_CTRL comes in the last of these ticks
+            bench.run_tick(permitted=160.0)
+        ticks = 0
+        bench.run_tick(permitted=160.0, **cause)
+        if "without" in cause:
+            ticks = 1  # since the last good frame
+        while bench.core["guard"] == GUARD_NORMAL:
+            bench.run_tick(permitted=160.0, **cause)
+            ticks += 1
+        assert ticks == bounds[fault], fault
+        assert bench.core["faults"] & fault
+        assert bench.core["guard"] == GUARD_SERVICE_BRAKE
+
+
+def test_the_guard_looks_ahead_to_the_target(running):
+    """4 m/s, 0.5 m/s^2: 16 m."""
+    signals = {"speed": 4.0, "target": 0.0}
+    running.run_tick(distance=16, **signals)
+    assert (running.core["guard"], running.core["faults"]) == (GUARD_NORMAL, 0)
+    running.run_tick(distance=15, **signals)
+    assert running.core["guard"] == GUARD_SERVICE_BRAKE
+    assert running.core["faults"] == FAULT_TARGET
+    running.run_tick(distance=15, speed=3.8)
+    assert running.core["guard"] == GUARD_NORMAL
+    assert running.core["faults"] == FAULT_TARGET
+
+
+@pytest.fixture
+def adjusted(bench):
+    """`adjusted(record, **values)` changes parameters of the bench's firmware for one test."""
+    before = bench.controller.params.copy()
+
+    def change(record, **values):
+        for name, value in values.items():
+            bench.controller.params[record][name] = value
+
+    yield change
+    bench.controller.params[:] = before
+
+
+def test_the_hold_brake_is_on_while_timetable_and_train_stand(bench, adjusted):
+    adjusted("guard", hold_brake=-(1 << 25))
+    bench.start()
+    sent = bench.run_tick()
+    assert get(sent[FORCE_CMD.name], FORCE_CMD.Mode) == COAST  # the preview moves already
+    adjusted("reference", preview=0)
+    bench.start()
+    sent = bench.run_tick()
+    assert get(sent[FORCE_CMD.name], FORCE_CMD.Mode) == HOLD
+    assert get(sent[FORCE_CMD.name], FORCE_CMD.Force) / 16 == -0.25 * MASS_KG
+    assert (bench.core["guard"], bench.inputs["limited"]) == (GUARD_HOLD, 1)
+    while bench.inputs["reference_speed"] == 0:
+        sent = bench.run_tick()
+    assert get(sent[FORCE_CMD.name], FORCE_CMD.Mode) == TRACTION
+    assert bench.core["guard"] == GUARD_NORMAL
+
+
+def test_implausible_measurements_brake_the_train(bench, adjusted):
+    believed = calibrated(guard_settings=GuardSettings()).params[0]["plausibility"]
+    adjusted("plausibility", **dict(zip(believed.dtype.names, believed, strict=True)))
+    for samples, fault in (
+        ([(1.0, 0.0), (1.6, 0.01)], FAULT_SPEED_IMPLAUSIBLE),
+        ([(1.0, 0.0), (1.0, -2.4)], FAULT_POSITION_IMPLAUSIBLE | FAULT_PROGRESS),
+        ([(20.0, 0.0), *[(20.0, 0.0)] * 3], FAULT_PROGRESS),
+        ([(20.0, 0.0), *[(20.0, 0.2 * k) for k in range(1, 50)]], 0),
+    ):
+        bench.start()
+        for speed, position in samples:
+            bench.run_tick(speed=speed, position=position, permitted=30.0)
+        assert bench.core["faults"] == fault
+        assert bench.core["guard"] == (GUARD_SERVICE_BRAKE if fault else GUARD_NORMAL)
+
+
+def test_a_command_that_the_cars_cannot_give_is_told_to_the_law(bench, adjusted):
+    """Two motor cars with 4 kN each; 10 kN wanted."""
+    boxes = distribution.calibrate([1.0] * 3, [1, 3], [4000.0] * 3, [2000.0] * 3)[0]
+    adjusted("distribution", **dict(zip(boxes.dtype.names, boxes, strict=True)))
+    bench.start()
+    for speed, force, limited in ((-0.1, 8000.0, 1), (-0.07, 7000.0, 0), (0.1, -6000.0, 1)):
+        sent = bench.run_tick(speed=speed)
+        given_out = get(sent[FORCE_CMD.name], FORCE_CMD.Force) / 16
+        assert given_out == pytest.approx(force, abs=2)
+        assert bench.inputs["limited"] == limited
+        cars = [
+            get(sent[CAR_FORCE_1.name], CAR_FORCE_1.Car1),
+            get(sent[CAR_FORCE_1.name], CAR_FORCE_1.Car2),
+            get(sent[CAR_FORCE_2.name], CAR_FORCE_2.Car3),
+        ]
+        assert sum(map(int, cars)) / 16 == pytest.approx(given_out, abs=0.1)
+
+
+def test_a_command_that_the_frame_cannot_carry_is_told_to_the_law(bench, adjusted):
+    adjusted("core", mass=2**31 - 1)  # 134 t more a frame than FORCE_CMD carries
+    bench.start()
+    sent = bench.run_tick(speed=-1.0)
+    assert get(sent[FORCE_CMD.name], FORCE_CMD.Force) == 2**23 - 1
+    assert bench.inputs["limited"] == 1
 
 
 def test_faults_and_guard_are_reported(running):
@@ -725,7 +921,23 @@ def test_a_new_run_forgets_the_line(on_a_line):
     assert on_a_line.inputs["neighbour"].tolist() == [0, 0]
 
 
+def test_a_radio_link_that_is_often_damaged_is_not_listened_to(on_a_line):
+    """Two damaged frames among those of a few ticks: the good one between them does not count."""
+    for bad in (0, 1, 1, 0):
+        hear(on_a_line, AHEAD_FRAMES, 0.0)
+        if bad:
+            on_a_line.controller.rx[NEIGHBOUR_AHEAD_MOTION.index]["payload"] ^= 1 << 20
+        stand(on_a_line)
+    assert on_a_line.link(NEIGHBOUR_AHEAD_MOTION)["state"] == e2e.INVALID
+
+
 # Records.
+
+
+def test_the_dbc_names_the_fault_bits():
+    comment = database().get_message_by_name("ATO_STATUS").get_signal_by_name("Faults").comment
+    assert comment == "Fault bits, lowest first: " + ", ".join(FAULTS.values())
+    assert list(FAULTS) == [1 << bit for bit in range(ATO_STATUS.Faults.length)]
 
 
 def fields_bytes(dtype):

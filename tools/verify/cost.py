@@ -215,11 +215,11 @@ def forget_counters(links: Any) -> None:
 
 
 @step
-def read_inputs_loop(n: Any, state: Any, rx: Any) -> None:
+def read_inputs_loop(n: Any, params: Any, state: Any, rx: Any) -> None:
     """Three frames received: decoded and checked end to end."""
     for _ in range(n):
         forget_counters(state[0].links)
-        firmware.read_inputs(state[0], rx)
+        firmware.read_inputs(params[0], state[0], rx)
 
 
 @step
@@ -243,13 +243,12 @@ def memory_loop(n: Any, params: Any, state: Any, cells: Any) -> None:
 @step
 def guard_loop(n: Any, params: Any, state: Any) -> None:
     """Faults of inputs and motion, state of the guard, limit of the force."""
-    core = state[0].core
+    setting, kept, seen = params[0].guard, state[0].guard, state[0].seen
     for k in range(n):
-        faults = guard.faults_of_inputs(params[0].guard, k & 3, k & 7, k & 3, k & 15, k & 1)
-        permitted = int64(core.permitted_speed)
-        faults = faults | guard.faults_of_motion(k, permitted, int64(0))
-        guarded = guard.state_of(params[0].guard, faults, k, permitted)
-        core.force = guard.limited(params[0].guard, guarded, int64(core.force))
+        seen.speed = k
+        faults = guard.faults_of_inputs(setting, seen) | guard.faults_of_motion(setting, seen)
+        reaction = guard.state_of(setting, kept, seen, faults)
+        guard.limited(setting, kept, seen, reaction, int64(k))
 
 
 @step
@@ -299,7 +298,7 @@ def check_parts(law: str) -> Iterator[Row]:
         tick(ROWS, params, profile, state, cells, here.rx, here.tx)
 
     parts: dict[str, Callable[[], Any]] = {
-        "receive 3 frames": lambda: read_inputs_loop(ROWS, state, here.rx),
+        "receive 3 frames": lambda: read_inputs_loop(ROWS, params, state, here.rx),
         "reference": lambda: reference_loop(ROWS, params, profile, state),
         "learning memory": lambda: memory_loop(ROWS, params, state, cells),
         "guard": lambda: guard_loop(ROWS, params, state),

@@ -28,6 +28,7 @@ SHARED_MODULES = (
     "controller.interface",
     "controller.memory",
     "controller.reference",
+    "controller.plausibility",
     "controller.guard",
     "controller.gradient_map",
     "controller.characteristic",

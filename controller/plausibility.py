@@ -1,0 +1,154 @@
+"""Plausibility of position and speed: what no train does, the sensors have not measured.
+
+    speed      within [v_min, v_max]; from one sample to the next |dv| <= jump_v + n a_max Ts
+    position   within [x_min, x_max]; from one sample to the next |dx| <= jump_x + n v_max Ts
+    progress   since the start of a window |dx - sum v Ts| <= progress_max, at every new position
+
+with n the control periods between the samples: a message may be missing for a while, and its value
+is held meanwhile. A window starts anew when it is over; the sum is that of trapezia.
+
+What is constantly wrong by e m/s (a sensor that stands still, a wheel that slips) is found within
+2 progress_max / e where that is less than two windows, whenever it begins.
+
+Contract: reads and writes its own state; returns fault bits; the same few operations a tick.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from can_dbc.step import int64, step
+from controller.interface import (
+    FAULT_POSITION_IMPLAUSIBLE,
+    FAULT_PROGRESS,
+    FAULT_SPEED_IMPLAUSIBLE,
+)
+
+PARAMS = np.dtype(
+    [
+        ("speed_min", np.int32),  # m/s, Q24
+        ("speed_max", np.int32),
+        ("speed_jump", np.int32),  # what noise may add between two samples, m/s, Q24
+        ("speed_step", np.int32),  # a_max Ts, m/s, Q24
+        ("position_min", np.int32),  # m, Q15
+        ("position_max", np.int32),
+        ("position_jump", np.int32),  # m, Q15
+        ("position_step", np.int32),  # v_max Ts, m, Q15
+        ("progress_max", np.int32),  # m, Q15
+        ("window", np.int32),  # control periods of a window of progress
+        ("period", np.int32),  # Ts, s, Q30, below 2^27
+        ("padding", np.int32),
+    ],
+    align=True,
+)
+
+STATE = np.dtype(
+    [
+        ("travelled", np.int64),  # sum v Ts since the start of the window, m, Q24
+        ("start", np.int32),  # position there, m, Q15
+        ("ticks", np.int32),  # since then
+        ("before", np.int32),  # speed of the last tick, m/s, Q24
+        ("speed", np.int32),  # last sample, m/s, Q24
+        ("speed_ticks", np.int32),  # from it to the tick that comes, 0: there was none
+        ("position", np.int32),  # last sample, m, Q15
+        ("position_ticks", np.int32),  # from it to the tick that comes, 0: there was none
+        ("padding", np.int32),
+    ],
+    align=True,
+)
+
+TICKS_MAX = 1 << 16  # where the ages of the samples stop; a link is lost long before
+
+
+@step
+def begin(state: Any) -> None:
+    """No sample yet: a run starts."""
+    state.travelled = 0
+    state.start = 0
+    state.ticks = 0
+    state.before = 0
+    state.speed = 0
+    state.speed_ticks = 0
+    state.position = 0
+    state.position_ticks = 0
+
+
+@step
+def faults_of_samples(
+    params: Any, state: Any, speed: Any, speed_is_new: Any, position: Any, position_is_new: Any
+) -> Any:
+    """Fault bits of this tick, from speed (Q24) and position (Q15) as held; once a tick."""
+    faults = faults_of_progress(params, state, speed, position, position_is_new)
+    if speed_is_new != 0:
+        faults |= faults_of_speed(params, state, speed)
+    if position_is_new != 0:
+        faults |= faults_of_position(params, state, position)
+    state.speed_ticks = older(int64(state.speed_ticks), speed_is_new)
+    state.position_ticks = older(int64(state.position_ticks), position_is_new)
+    return faults
+
+
+@step
+def older(ticks: Any, is_new: Any) -> Any:
+    """Ticks from the last sample to the tick that comes."""
+    if is_new != 0:
+        return int64(1)
+    if ticks == 0:
+        return int64(0)
+    return min(ticks + 1, int64(TICKS_MAX))
+
+
+@step
+def faults_of_speed(params: Any, state: Any, speed: Any) -> Any:
+    """Of a new sample: range, and the change since the last one."""
+    faults = int64(0)
+    if speed < int64(params.speed_min) or speed > int64(params.speed_max):
+        faults |= FAULT_SPEED_IMPLAUSIBLE
+    ticks = int64(state.speed_ticks)
+    most = int64(params.speed_jump) + ticks * int64(params.speed_step)
+    if ticks != 0 and abs(speed - int64(state.speed)) > most:
+        faults |= FAULT_SPEED_IMPLAUSIBLE
+    state.speed = speed
+    return faults
+
+
+@step
+def faults_of_position(params: Any, state: Any, position: Any) -> Any:
+    """Of a new sample: range, and the change since the last one."""
+    faults = int64(0)
+    if position < int64(params.position_min) or position > int64(params.position_max):
+        faults |= FAULT_POSITION_IMPLAUSIBLE
+    ticks = int64(state.position_ticks)
+    most = int64(params.position_jump) + ticks * int64(params.position_step)
+    if ticks != 0 and abs(position - int64(state.position)) > most:
+        faults |= FAULT_POSITION_IMPLAUSIBLE
+    state.position = position
+    return faults
+
+
+@step
+def faults_of_progress(
+    params: Any, state: Any, speed: Any, position: Any, position_is_new: Any
+) -> Any:
+    """Of position against speed. Nothing before the first position, which starts the first
+    window."""
+    faults = int64(0)
+    is_first = int64(state.position_ticks) == 0
+    if not is_first:
+        # Q24 * Q30, below 2^32 * 2^27; the sum stops far outside of what a window can hold.
+        passed = ((int64(state.before) + speed) * int64(params.period)) >> 31
+        most = int64(1) << 50
+        state.travelled = min(max(int64(state.travelled) + passed, -most), most)
+        state.ticks = min(int64(state.ticks) + 1, int64(TICKS_MAX))
+        apart = position - int64(state.start) - (int64(state.travelled) >> 9)
+        if position_is_new != 0 and abs(apart) > int64(params.progress_max):
+            faults |= FAULT_PROGRESS
+    state.before = speed
+    is_over = int64(state.ticks) >= int64(params.window)
+    if position_is_new != 0 and (is_first or is_over):
+        state.start = position
+        state.travelled = 0
+        state.ticks = 0
+    return faults
