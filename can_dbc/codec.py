@@ -24,7 +24,7 @@ HEADER = ("Crc", "Counter", "DataIdNibble")
 # order, so the last frame of each direction, TRAIN_POSITION and FORCE_CMD, closes its half of the
 # tick.
 NEEDED: dict[str, tuple[str, ...]] = {
-    "RUN_CTRL": ("RunState", "Pace", "Iteration"),
+    "RUN_CTRL": ("RunState", "Pace", "Iteration", "TimetableRate"),
     "ATP_LIMIT": ("PermittedSpeed", "TargetSpeed", "TargetDistance", "Supervision"),
     "NEIGHBOUR_AHEAD_POSITION": ("Position", "Age", "Valid", "EmergencyBrake", "Rebased"),
     "NEIGHBOUR_AHEAD_MOTION": ("Speed", "OffsetSpeed"),

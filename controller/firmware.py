@@ -92,6 +92,7 @@ _SPEED_SHIFT = Q_SPEED - binary_exponent(TRAIN_SPEED, "Speed")
 _ACCELERATION_SHIFT = Q_ACCELERATION - binary_exponent(TRAIN_SPEED, "Acceleration")
 _POSITION_SHIFT = Q_POSITION - binary_exponent(TRAIN_POSITION, "Position")
 _FORCE_SHIFT = Q_FORCE - binary_exponent(FORCE_CMD, "Force")
+_RATE_SHIFT = reference.Q_RATE - binary_exponent(RUN_CTRL, "TimetableRate")
 _POSITION_ERROR_SHIFT = Q_POSITION - binary_exponent(ATO_TRACKING, "PositionError")
 _SPEED_ERROR_SHIFT = Q_SPEED - binary_exponent(ATO_TRACKING, "SpeedError")
 _RADIO_OFFSET_SHIFT = rebasing.Q_OFFSET - binary_exponent(ATO_RADIO, "Offset")
@@ -176,9 +177,9 @@ def state_dtype(law_state: np.dtype) -> np.dtype:
 
 
 @step
-def begin(params: Any, profile: Any, state: Any, cells: Any) -> None:
+def begin(params: Any, profile: Any, state: Any, cells: Any, rate: Any) -> None:
     """State of a new run: reference at its start, counters at 0, no fault; the learning memory
-    stays."""
+    stays. `rate` of its timetable, less 1, Q24."""
     core = state.core
     core.tick = 0
     core.faults = 0
@@ -190,8 +191,8 @@ def begin(params: Any, profile: Any, state: Any, cells: Any) -> None:
         e2e.begin_link(state.links[i])
     guard.begin(state.seen, state.guard)
     plausibility.begin(state.plausibility)
-    reference.rewind(state.cursor, profile)
-    reference.rewind(state.ahead, profile)
+    reference.rewind(state.cursor, profile, rate)
+    reference.rewind(state.ahead, profile, rate)
     for i in range(reference.PREVIEW_MAX):
         if i < int64(params.reference.preview):
             reference.advance(params.reference, state.ahead, profile)
@@ -515,7 +516,8 @@ def build_tick(law_step: Any) -> Any:
                 core.run_state = wanted
                 core.iteration = get(word, RUN_CTRL.Iteration)
                 if wanted == ARMED:
-                    begin(params, profile, state, cells)
+                    rate = get(word, RUN_CTRL.TimetableRate) << _RATE_SHIFT
+                    begin(params, profile, state, cells, rate)
                 e2e.send(core, tx, ATO_STATUS, status_word(params, core))
         if int64(core.run_state) == RUNNING and period == 1:
             read_inputs(params, state, rx)

@@ -5,8 +5,13 @@ Units: position 2**-40 m; with the control period Ts, acceleration 6 * 2**-40 / 
 + J, a += J (old values on the right). The profile takes eight bytes a segment, and firmware, plant
 and reports agree to the bit.
 
-Contract: `advance` moves a cursor by one tick in bounded time; past the last segment the cursor
-stays where it is.
+A run may go through its timetable faster or slower than planned: p(r t), r = 1 + rate, with r p'
+and r^2 p'' for speed and acceleration. The cursor then stands inside a tick of the table, at phase
+f of it, where the cubic is x + 3 v f + 3 a f^2 + J f^3, v + 2 a f + J f^2, a + J f. The phase is
+exact, and each of these is within 2 units. With rate 0 the phase stays 0.
+
+Contract: `advance` moves a cursor by one control period in bounded time; past the last segment the
+cursor stays where it is.
 """
 
 from __future__ import annotations
@@ -27,7 +32,11 @@ CURSOR = np.dtype(
         ("v", np.int64),  # 3 * 2^-40 / Ts m/s
         ("a", np.int64),  # 6 * 2^-40 / Ts^2 m/s^2
         ("segment", np.int32),  # index into the table
-        ("left", np.int32),  # ticks left in it
+        ("left", np.int32),  # ticks left in it; 0 at the end of the table
+        ("jerk", np.int32),  # of this tick
+        ("phase", np.int32),  # part of this tick that is over, Q24
+        ("rate", np.int32),  # of the timetable, less 1, Q24, -1/2 to 1/2
+        ("padding", np.int32),
     ],
     align=True,
 )
@@ -44,48 +53,102 @@ REFERENCE_PARAMS = np.dtype(
 )
 
 PREVIEW_MAX = 128
+Q_RATE = 24
+ONE = 1 << Q_RATE
 
 
 @step
-def rewind(cursor: Any, profile: Any) -> None:
-    """The cursor at the start of the profile, standing."""
+def rewind(cursor: Any, profile: Any, rate: Any) -> None:
+    """The cursor at the start of the profile, standing; `rate` of the timetable, less 1, Q24."""
     cursor.x = 0
     cursor.v = 0
     cursor.a = 0
     cursor.segment = 0
     cursor.left = profile[0].ticks
+    cursor.jerk = profile[0].jerk
+    cursor.phase = 0
+    cursor.rate = rate
 
 
 @step
 def advance(params: Any, cursor: Any, profile: Any) -> None:
-    """The cursor one tick later."""
-    if int64(cursor.left) == 0 and int64(cursor.segment) < int64(params.segment_count) - 1:
-        cursor.segment = int64(cursor.segment) + 1
-        cursor.left = profile[int64(cursor.segment)].ticks
+    """The cursor one control period later: none, one or two ticks of the table."""
+    phase = int64(cursor.phase) + ONE + int64(cursor.rate)
+    for _ in range(2):
+        if phase >= ONE:
+            phase -= ONE
+            next_tick(params, cursor, profile)
+    cursor.phase = phase if int64(cursor.left) > 0 else 0
+
+
+@step
+def next_tick(params: Any, cursor: Any, profile: Any) -> None:
+    """The cursor at the start of the next tick of the table."""
     if int64(cursor.left) > 0:
-        jerk = int64(profile[int64(cursor.segment)].jerk)
+        jerk = int64(cursor.jerk)
         x = int64(cursor.x)
         v = int64(cursor.v)
         a = int64(cursor.a)
         cursor.x = x + 3 * (v + a) + jerk
         cursor.v = v + 2 * a + jerk
         cursor.a = a + jerk
-        cursor.left = int64(cursor.left) - 1
+        left = int64(cursor.left) - 1
+        if left == 0:
+            cursor.jerk = 0
+            following = int64(cursor.segment) + 1
+            if following < int64(params.segment_count):
+                cursor.segment = following
+                cursor.jerk = profile[following].jerk
+                left = int64(profile[following].ticks)
+        cursor.left = left
+
+
+@step
+def times(value: Any, factor: Any) -> Any:
+    """value * factor / 2^24, rounded half up, without a product beyond 63 bits: 0 <= factor <
+    2^25, |value| < 2^61."""
+    return (value >> Q_RATE) * factor + round_shift((value & (ONE - 1)) * factor, Q_RATE)
 
 
 @step
 def position(cursor: Any) -> Any:
     """Reference position, m, Q15."""
-    return sat32(round_shift(int64(cursor.x), 25))
+    x = int64(cursor.x)
+    if int64(cursor.phase) > 0:
+        f = int64(cursor.phase)
+        curve = 3 * int64(cursor.a) + times(int64(cursor.jerk), f)
+        x += times(3 * int64(cursor.v) + times(curve, f), f)
+    return sat32(round_shift(x, 25))
 
 
 @step
 def speed(params: Any, cursor: Any) -> Any:
     """Reference speed, m/s, Q24."""
-    return sat32(round_shift(int64(cursor.v) * int64(params.speed_factor), 16))
+    v = int64(cursor.v)
+    if int64(cursor.rate) != 0:
+        f = int64(cursor.phase)
+        v += times(2 * int64(cursor.a) + times(int64(cursor.jerk), f), f)
+        v = times(v, ONE + int64(cursor.rate))
+    return sat32(round_shift(v * int64(params.speed_factor), 16))
 
 
 @step
 def acceleration(params: Any, cursor: Any) -> Any:
     """Reference acceleration, m/s^2, Q27."""
-    return sat32(round_shift(int64(cursor.a) * int64(params.acceleration_factor), 13))
+    a = int64(cursor.a)
+    if int64(cursor.rate) != 0:
+        rate = ONE + int64(cursor.rate)
+        a += times(int64(cursor.jerk), int64(cursor.phase))
+        a = times(times(a, rate), rate)
+    return sat32(round_shift(a * int64(params.acceleration_factor), 13))
+
+
+def length(profile: np.ndarray) -> int:
+    """Position of the end of the table, 2^-40 m."""
+    x = v = a = 0
+    for ticks, jerk in zip(profile["ticks"].tolist(), profile["jerk"].tolist(), strict=True):
+        # `ticks` times the recursion at once: its cubic at f = ticks.
+        x += 3 * v * ticks + 3 * a * ticks**2 + jerk * ticks**3
+        v += 2 * a * ticks + jerk * ticks**2
+        a += jerk * ticks
+    return int(x)

@@ -18,6 +18,7 @@ RESISTANCE = (0.0126, 8.9e-4, 3.8e-5)  # m/s^2, 1/s, 1/m: a + b v + c v^2
 PERIOD_S = 0.01
 ANSWER_S = 1.0  # longest wait for the answer to a tick
 CONFIRM_S = 60.0  # longest wait for a controller
+AS_PLANNED = {"Pace": "lockstep", "TimetableRate": 0.0}
 
 
 def serve(link: Link, given: argparse.Namespace) -> None:
@@ -28,7 +29,7 @@ def serve(link: Link, given: argparse.Namespace) -> None:
         position = speed = acceleration = 0.0
         for tick, row in enumerate(profile):
             if tick % 10 == 0:
-                link.send("RUN_CTRL", RunState="running", Pace="lockstep", Iteration=number)
+                link.send("RUN_CTRL", RunState="running", Iteration=number, **AS_PLANNED)
             send_limit(link, row["permitted_speed_m_s"], speed)
             link.send("TRAIN_SPEED", Speed=speed, Acceleration=acceleration, Quality="good")
             # The last frame: it starts the controller's tick.
@@ -48,7 +49,7 @@ def announce(link: Link, state: str, number: int) -> None:
     while (now := time.monotonic()) < deadline:
         if state == "armed":
             link.restart()
-        link.send("RUN_CTRL", RunState=state, Pace="lockstep", Iteration=number)
+        link.send("RUN_CTRL", RunState=state, Iteration=number, **AS_PLANNED)
         while (left := now + 0.1 - time.monotonic()) > 0:
             name, said = link.receive(left)
             if name == "ATO_STATUS" and (said["RunState"], said["Iteration"]) == (state, number):

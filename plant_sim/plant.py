@@ -102,6 +102,7 @@ NODE_STATE = np.dtype(
         ("run_state", np.int64),
         ("iteration", np.int64),
         ("tick", np.int64),
+        ("timetable_rate", np.int64),  # of the run, less 1, 2^-24
         ("limit", np.int64),  # index of the limit in force
         ("permitted_speed_m_s", np.float64),
         (
@@ -146,8 +147,10 @@ def state_dtype(train_state: np.dtype) -> np.dtype:
 @step
 def control_word(node: Any) -> Any:
     """RUN_CTRL."""
-    return put(RUN_CTRL.RunState, int64(node.run_state)) + put(
-        RUN_CTRL.Iteration, int64(node.iteration)
+    return (
+        put(RUN_CTRL.RunState, int64(node.run_state))
+        + put(RUN_CTRL.Iteration, int64(node.iteration))
+        + put(RUN_CTRL.TimetableRate, int64(node.timetable_rate))
     )
 
 

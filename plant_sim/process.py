@@ -203,6 +203,7 @@ def one_run(
     ticks = here.ticks(run)
     truth = np.zeros((len(ports), ticks), plant.TRUTH)
     file = out / f"truth_{run}.npy"
+    here.prepare(run)
     for train, port in enumerate(ports):
         agree(here, train, port, plant.ARMED, run, arming_s, stop)
     started = time.perf_counter()

@@ -12,6 +12,9 @@ In these, one control period is, with the old values on the right,
     x += 3 v + 3 a + J;   v += 2 a + J;   a += J
 
 without any loss, so firmware, plant and reports agree to the bit. The profile starts at rest at 0.
+
+A run may go through it faster or slower, p(r t): `stretched` gives its ticks, to the bit those of
+the firmware's cursor, which stands inside a tick of the table then.
 """
 
 import math
@@ -25,6 +28,8 @@ SEGMENT = np.dtype([("ticks", np.int32), ("jerk", np.int32)], align=True)
 POSITION_UNIT_M = 2.0**-40
 LONGEST_PROFILE_S = 32768  # position at the top speed of Q24 stays within 64 bits
 INT32 = np.iinfo(np.int32)
+RATE_BITS = 24  # of the timetable's rate against the planned one
+RATE_ONE = 1 << RATE_BITS
 
 
 @dataclass(frozen=True)
@@ -58,12 +63,21 @@ def evaluate(segments: NDArray[np.void], period_s: float) -> Profile:
     # Range-checking each column before it is summed into the next keeps every sum within 64 bits.
     jerk = np.repeat(segments["jerk"].astype(np.int64), ticks)
     a = _running_sum(jerk)
-    acceleration_q27 = _to_int32(a, acceleration_factor, 13, "acceleration")
+    _to_int32(a, acceleration_factor, 13, "acceleration")
     v = _running_sum(2 * a[:-1] + jerk)
-    speed_q24 = _to_int32(v, speed_factor, 16, "speed")
+    _to_int32(v, speed_factor, 16, "speed")
     x = _running_sum(3 * v[:-1] + 3 * a[:-1] + jerk)
-    position_q15 = _to_int32(x, 1, 25, "position")
+    return _profile(x, v, a, speed_factor, acceleration_factor)
 
+
+def _profile(
+    x: NDArray[np.int64],
+    v: NDArray[np.int64],
+    a: NDArray[np.int64],
+    speed_factor: int,
+    acceleration_factor: int,
+) -> Profile:
+    """Columns in table units in all forms. Raises ValueError if one leaves its format."""
     return Profile(
         x=x,
         v=v,
@@ -71,9 +85,9 @@ def evaluate(segments: NDArray[np.void], period_s: float) -> Profile:
         position_m=_to_si(x, 1),
         speed_m_s=_to_si(v, speed_factor),
         acceleration_m_s2=_to_si(a, acceleration_factor),
-        position_q15=position_q15,
-        speed_q24=speed_q24,
-        acceleration_q27=acceleration_q27,
+        position_q15=_to_int32(x, 1, 25, "position"),
+        speed_q24=_to_int32(v, speed_factor, 16, "speed"),
+        acceleration_q27=_to_int32(a, acceleration_factor, 13, "acceleration"),
     )
 
 
@@ -86,6 +100,44 @@ def displaced(profile: Profile, distance_m: float) -> Profile:
     return replace(
         profile, x=x, position_m=_to_si(x, 1), position_q15=_to_int32(x, 1, 25, "position")
     )
+
+
+def rate_of(planned_ticks: int, ticks: int) -> int:
+    """r - 1 in Q24 for a run of `ticks` control periods, so that its last one reaches the end of
+    the profile.
+
+    Raises ValueError if that is not in [-1/2, 1/2): what RUN_CTRL carries.
+    """
+    rate = -(-(planned_ticks << RATE_BITS) // ticks) - RATE_ONE
+    if not -RATE_ONE // 2 <= rate < RATE_ONE // 2:
+        raise ValueError(f"{ticks} ticks are not 2/3 to 2 times the planned {planned_ticks}")
+    return rate
+
+
+def stretched_ticks(planned_ticks: int, rate: int) -> int:
+    """Control periods until the end of a profile that is gone through at 1 + rate * 2^-24."""
+    return -(-(planned_ticks << RATE_BITS) // (RATE_ONE + rate))
+
+
+def stretched(profile: Profile, segments: NDArray[np.void], period_s: float, rate: int) -> Profile:
+    """The profile gone through at r = 1 + rate * 2^-24 of its planned pace: p(r t), r p', r^2 p''.
+
+    Raises ValueError if it then leaves the firmware's range.
+    """
+    speed_factor, acceleration_factor = unit_factors(period_s)
+    planned = len(profile.x) - 1
+    factor = RATE_ONE + rate
+    clock = np.arange(stretched_ticks(planned, rate) + 1) * factor
+    at = np.minimum(clock >> RATE_BITS, planned)
+    phase = np.where(at < planned, clock & (RATE_ONE - 1), 0)
+    jerk = np.repeat(segments["jerk"].astype(np.int64), segments["ticks"])
+    jerk = np.append(jerk, 0)[at]  # at the end the phase is 0, whatever the jerk
+    x, v, a = profile.x[at], profile.v[at], profile.a[at]
+    curve = _times(3 * a + _times(jerk, phase), phase)
+    x = x + _times(3 * v + curve, phase)
+    v = _times(v + _times(2 * a + _times(jerk, phase), phase), factor)
+    a = _times(_times(a + _times(jerk, phase), factor), factor)
+    return _profile(x, v, a, speed_factor, acceleration_factor)
 
 
 def unit_factors(period_s: float) -> tuple[int, int]:
@@ -107,6 +159,12 @@ def unit_factors(period_s: float) -> tuple[int, int]:
 
 def _running_sum(steps: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate([np.zeros(1, np.int64), np.cumsum(steps)])
+
+
+def _times(values: NDArray[np.int64], factor: NDArray[np.int64] | int) -> NDArray[np.int64]:
+    """values * factor * 2^-24, rounded half up, with no product beyond 64 bits."""
+    low = (values & (RATE_ONE - 1)) * factor
+    return (values >> RATE_BITS) * factor + ((low + RATE_ONE // 2) >> RATE_BITS)
 
 
 def _to_si(values: NDArray[np.int64], factor: int) -> NDArray[np.float64]:

@@ -24,7 +24,7 @@ import numpy as np
 from plant_sim.actuator import Actuator
 from plant_sim.line import Line
 from plant_sim.planner import PlanError, ProfilePlan, plan_profile
-from plant_sim.profile import Profile, displaced, evaluate
+from plant_sim.profile import Profile, displaced, evaluate, rate_of, stretched
 from plant_sim.track import Track
 from plant_sim.trains import couplers, lumped, point
 
@@ -70,14 +70,21 @@ class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class RunLength(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Runs of random length: each is cut after a uniform time, new in each run, while the train may
-    still be moving; one that would last beyond the profile ends with it."""
+    """Runs of random length, uniform, new in each run.
+
+    `cut`: each ends after that time, while the train may still be moving; one that would last
+    beyond the profile ends with it. `stretched`: an early or late run, whose timetable goes through
+    the profile in that time.
+    """
 
     shortest_s: Positive
     longest_s: Positive
     first_s: Positive | None = None  # length of run 1, as a paper may give it
+    reading: str = "cut"  # cut | stretched
 
     def __post_init__(self) -> None:
+        if self.reading not in ("cut", "stretched"):
+            raise ValueError(f"reading is {self.reading!r}, expected cut or stretched")
         if self.longest_s < self.shortest_s:
             raise ValueError(
                 f"longest_s is {self.longest_s:g}, expected shortest_s or more, {self.shortest_s:g}"
@@ -144,8 +151,9 @@ class Loaded(msgspec.Struct, frozen=True):
     digest: str  # of the merged content
     scenario: Scenario
     segments: np.ndarray  # profile.SEGMENT
-    profile: Profile  # of this train
+    profile: Profile  # of this train, as planned or at `timetable_rate`
     train: int = 0  # place on the line, 0 leads
+    timetable_rate: int = 0  # of a run against the planned one, less 1, 2^-24
 
     @property
     def folder_name(self) -> str:
@@ -160,7 +168,7 @@ class Loaded(msgspec.Struct, frozen=True):
 
     @property
     def ticks(self) -> int:
-        """Control periods of a whole run."""
+        """Control periods of a whole run, as planned or at `timetable_rate`."""
         return len(self.profile.x)
 
     @property
@@ -306,7 +314,28 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
     )
     if scenario.line:
         members(loaded)  # so that a wrong one is refused here
+    if scenario.run_length and scenario.run_length.reading == "stretched":
+        try:
+            _check_stretch(loaded, scenario.run_length)
+        except ValueError as error:
+            raise ScenarioError(f"{_place(path, case)}: [run_length]: {error}") from None
     return loaded
+
+
+def at_rate(loaded: Loaded, rate: int) -> Loaded:
+    """A planned scenario with the reference of a run whose timetable goes at 1 + rate * 2^-24."""
+    if rate == 0:
+        return loaded
+    period_s = loaded.scenario.period_s
+    profile = stretched(loaded.profile, loaded.segments, period_s, rate)
+    return msgspec.structs.replace(loaded, profile=profile, timetable_rate=rate)
+
+
+def _check_stretch(loaded: Loaded, lengths: RunLength) -> None:
+    """Raises ValueError if the earliest or the latest run cannot be."""
+    for length_s in (lengths.shortest_s, lengths.longest_s, lengths.first_s):
+        if length_s is not None:
+            at_rate(loaded, rate_of(loaded.ticks - 1, round(length_s / loaded.scenario.period_s)))
 
 
 def _place(path: Path, case: str) -> str:

@@ -15,7 +15,8 @@ from can_dbc.codec import MAILBOX, MESSAGE_COUNT, NEIGHBOUR_AHEAD_POSITION
 from can_dbc.step import INTERPRETED, step
 from plant_sim import actuator, plant, track
 from plant_sim.line import Fault
-from plant_sim.scenario import MODELS, Loaded, Scenario, members
+from plant_sim.profile import RATE_ONE, rate_of, stretched_ticks
+from plant_sim.scenario import MODELS, Loaded, RunLength, Scenario, at_rate, members
 from plant_sim.trains import point
 from plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
@@ -46,6 +47,14 @@ class World:
     def ticks(self, run: int) -> int:
         """Control periods of a run."""
         return run_ticks(self.members[0], self.seed, run)
+
+    def prepare(self, run: int) -> None:
+        """What a run has of its own before it is announced: its timetable, and the limit along
+        that."""
+        rate = timetable_rate(self.members[0], self.seed, run)
+        if rate != int(self.state[0]["node"]["timetable_rate"]):
+            self.limits = rows(limits_of(at_rate(self.members[0], rate)))
+        self.state["node"]["timetable_rate"] = rate
 
 
 def rows(array: np.ndarray) -> Any:
@@ -140,23 +149,41 @@ def limits_of(loaded: Loaded) -> np.ndarray:
         limits["speed_m_s"] = speed_m_s[last] + plan.limit_above_m_s
         return limits
     limits = np.zeros(len(plan.limits), plant.LIMIT)
+    pace = 1 + loaded.timetable_rate / RATE_ONE
     for row, limit in zip(limits, plan.limits, strict=True):
-        row["until_tick"] = round(limit.until_s / period_s)
+        row["until_tick"] = round(limit.until_s / period_s / pace)
         row["speed_m_s"] = limit.speed_m_s
     return limits
 
 
 def run_ticks(loaded: Loaded, seed: int, run: int) -> int:
-    """Control periods of a run: all, or as far as its random length goes."""
+    """Control periods of a run: all of its timetable, or as far as its random length goes."""
     lengths = loaded.scenario.run_length
     if lengths is None:
         return loaded.ticks
+    if lengths.reading == "stretched":
+        return stretched_ticks(loaded.ticks - 1, timetable_rate(loaded, seed, run)) + 1
+    return min(_length_ticks(loaded, lengths, seed, run) + 1, loaded.ticks)
+
+
+def timetable_rate(loaded: Loaded, seed: int, run: int) -> int:
+    """How much faster than planned a run's timetable is gone through: planned over actual duration,
+    less 1, in 2^-24."""
+    lengths = loaded.scenario.run_length
+    if lengths is None or lengths.reading != "stretched":
+        return 0
+    planned = int(loaded.segments["ticks"].sum())
+    return rate_of(planned, _length_ticks(loaded, lengths, seed, run))
+
+
+def _length_ticks(loaded: Loaded, lengths: RunLength, seed: int, run: int) -> int:
+    """Random length of a run, control periods."""
     length_s = lengths.shortest_s + (lengths.longest_s - lengths.shortest_s) * float(
         _uniform(_bits(seed, run, RUN_LENGTH, 1))[0]
     )
     if run == 1 and lengths.first_s is not None:
         length_s = lengths.first_s
-    return min(int(length_s / loaded.scenario.period_s + 0.5) + 1, loaded.ticks)
+    return int(length_s / loaded.scenario.period_s + 0.5)
 
 
 def _bits(seed: int, run: int, stream: int, count: int) -> np.ndarray:

@@ -423,16 +423,22 @@ def list_scenarios() -> None:
 @app.command()
 def profile(
     scenario: Annotated[str, typer.Argument(help="Name of a scenario or a .toml file.")],
+    run: Annotated[
+        int, typer.Option(min=0, help="Run whose timetable to print; 0: as planned.")
+    ] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of that run.")] = 1,
 ) -> None:
     """Print the reference profile and the limit of each control period as CSV, for nodes of your
     own."""
     import numpy as np
 
-    from plant_sim.scenario import load
-    from plant_sim.world import limits_of
+    from plant_sim.scenario import at_rate, load
+    from plant_sim.world import limits_of, timetable_rate
 
     with one_line_for_bad_input():
         loaded = load(scenario)
+    if run:
+        loaded = at_rate(loaded, timetable_rate(loaded, seed, run))
     reference, limits = loaded.profile, limits_of(loaded)
     row_of_tick = np.searchsorted(limits["until_tick"], np.arange(loaded.ticks))
     limit_m_s = limits["speed_m_s"][np.minimum(row_of_tick, len(limits) - 1)]

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from plant_sim.scenario import Loaded, members
+from plant_sim.scenario import Loaded, at_rate, members
 from tools import line, setup, sil
+from tools.frames import timetable_rate
 from tools.trace import TraceWriter
 
 
@@ -51,6 +52,9 @@ def compare(
                 faults = sorted({name for result in results for name in result.faults})
                 rows.append({"law": law, "run": run, **row, "faults": faults})
                 if run == numbers[-1]:
+                    rate = timetable_rate(results[0].frames)
+                    if rate:
+                        writer.reference(number, at_rate(loaded, rate).profile)
                     for train, result in enumerate(results):
                         writer.frames(number, result.frames, train)
                         writer.truth(number, result.truth, train)

@@ -88,6 +88,15 @@ def run_controls(frame_ids: np.ndarray, words: np.ndarray) -> Iterator[tuple[int
             yield at, int(get(word, RUN_CTRL.RunState)), int(get(word, RUN_CTRL.Iteration))
 
 
+def timetable_rate(frames: np.ndarray) -> int:
+    """Raw RUN_CTRL.TimetableRate of a run; 0, as planned, if no RUN_CTRL of it is good."""
+    _ticks, words = columns(frames, RUN_CTRL)
+    for word in words.tolist():
+        if e2e.check(word, -1, RUN_CTRL.data_id) == e2e.OK:
+            return int(get(word, RUN_CTRL.TimetableRate))
+    return 0
+
+
 def ticks_of(frame_ids: np.ndarray) -> np.ndarray:
     """Tick of each frame of a run from its start: FORCE_CMD is the last frame of its tick."""
     closes = frame_ids == FORCE_CMD.frame_id

@@ -9,9 +9,9 @@ import numpy as np
 
 from can_dbc.codec import ATO_TRACKING
 from controller.registry import law_label
-from plant_sim.scenario import Loaded
+from plant_sim.scenario import Loaded, at_rate
 from tools import metrics
-from tools.frames import decode, held_values
+from tools.frames import decode, held_values, timetable_rate
 from tools.setup import error_weight
 from tools.sil import RunResult, commanded_force_n
 
@@ -19,10 +19,16 @@ from tools.sil import RunResult, commanded_force_n
 def run_row(
     members: list[Loaded], law: str, frames: list[np.ndarray], truths: list[np.ndarray]
 ) -> dict[str, Any]:
-    """Metrics of one run, keys with units. `frames` and `truths` have an array for each train."""
+    """Metrics of one run, keys with units. `frames` and `truths` have an array for each train.
+
+    Errors are against the timetable that the frames announce.
+    """
     rows = [
         metrics.run_metrics(
-            member, truth, commanded_force_n(sent, len(truth)), error_weight(member, law)
+            at_rate(member, timetable_rate(sent)),
+            truth,
+            commanded_force_n(sent, len(truth)),
+            error_weight(member, law),
         )
         for member, sent, truth in zip(members, frames, truths, strict=True)
     ]

@@ -15,9 +15,9 @@ import numpy as np
 
 from controller.laws import drac
 from controller.registry import law_label, load_law
-from plant_sim.scenario import Loaded
+from plant_sim.scenario import Loaded, at_rate
 from plant_sim.trains import point
-from tools.frames import estimate, held_values
+from tools.frames import estimate, held_values, timetable_rate
 
 # As the plant's truth: one float64 column.
 LYAPUNOV = np.dtype([("lyapunov", np.float64)])
@@ -45,8 +45,9 @@ def lyapunov(loaded: Loaded, law: str, frames: np.ndarray, truth: np.ndarray) ->
     eta = (estimated - _true_theta(train, ticks, scenario.period_s)) / span
     rate = [drac.normalised_rate(i, gains.Gamma[i], gains.theta_span[i]) for i in range(3)]
 
-    z1 = truth["position_m"] - loaded.profile.position_m[:ticks]
-    z2 = gains.c1 * z1 + truth["speed_m_s"] - loaded.profile.speed_m_s[:ticks]
+    reference = at_rate(loaded, timetable_rate(frames)).profile
+    z1 = truth["position_m"] - reference.position_m[:ticks]
+    z2 = gains.c1 * z1 + truth["speed_m_s"] - reference.speed_m_s[:ticks]
     mass_t = train.mass_kg / 1000
     table = np.zeros(ticks, LYAPUNOV)
     table["lyapunov"] = (

@@ -16,6 +16,7 @@ It says on stdout, in JSON lines:
 
 and takes on stdin:
 
+    {"command": "reference", "run": 1, "file": "x.npy"}    of a run on a timetable of its own
     {"command": "truth", "run": 1, "file": "truth.npy"}    true state of the plant, for the trace
     {"command": "summary", "run": 1, "row": {…}}           the run's row of summary.json, likewise
     {"command": "stop"}                                    as SIGTERM, SIGINT and the end of stdin
@@ -36,7 +37,7 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import can
 import numpy as np
@@ -171,10 +172,13 @@ class Recorder:
                 self._log(int(np.searchsorted(self.frames["tick"], self.tick)))
 
     def obey(self, command: dict[str, Any]) -> None:
-        """Log what the parent knows of a run: `truth` or `summary`."""
+        """Log what the parent knows of a run: `reference`, `truth` or `summary`."""
         if self._trace is None:
             return
-        if command["command"] == "truth":
+        if command["command"] == "reference":
+            reference = np.load(command["file"]).view(np.recarray)
+            self._trace.reference(command["run"], cast(Reference, reference))
+        elif command["command"] == "truth":
             tables = np.atleast_2d(np.load(command["file"]))  # of all trains
             self._trace.truth(command["run"], tables[self._train], self._train)
         elif self._train == 0:

@@ -32,7 +32,7 @@ from controller.process import Frame, answers, inbox_of
 from controller.registry import load_law
 from plant_sim.scenario import Loaded, load
 from tools import record, setup
-from tools.frames import ARMED, ENDED, FRAME, multiplexed_by
+from tools.frames import ARMED, ENDED, FRAME, multiplexed_by, timetable_rate
 from tools.record import Origin, RecordedRun, RecordError
 from tools.recorder import lost_frames
 
@@ -154,11 +154,12 @@ def replay(prepared: Replay) -> Iterator[Result]:
         last = run.number
         recorded = run.frames[np.isin(run.frames["frame_id"], _ids_sent_by(CONTROLLER))]
         sensed = run.frames[~np.isin(run.frames["frame_id"], _ids_sent_by(CONTROLLER))]
-        counter = _control(controller, ARMED, run.number, counter)
+        rate = timetable_rate(sensed)
+        counter = _control(controller, ARMED, run.number, rate, counter)
         answered = _answered(controller, sensed)
         controls = sensed["payload"][sensed["frame_id"] == RUN_CTRL.frame_id]
         counter = e2e.next_counter(int(get(int(controls[-1]), RUN_CTRL.Counter)))
-        counter = _control(controller, ENDED, run.number, counter)
+        counter = _control(controller, ENDED, run.number, rate, counter)
         difference = first_difference(run.number, recorded, answered)
         ticks = int(np.count_nonzero(sensed["frame_id"] == TRAIN_POSITION.frame_id))
         yield Result(run.number, ticks, len(recorded), difference)
@@ -173,9 +174,10 @@ def _power_up(prepared: Replay) -> node.Controller:
     return controller
 
 
-def _control(controller: node.Controller, state: int, run: int, counter: int) -> int:
+def _control(controller: node.Controller, state: int, run: int, rate: int, counter: int) -> int:
     """RUN_CTRL to the controller between runs; returns the next counter."""
     word = put(RUN_CTRL.RunState, state) + put(RUN_CTRL.Iteration, run)
+    word += put(RUN_CTRL.TimetableRate, rate)
     payload = int(e2e.protect(word, counter, RUN_CTRL.data_id))
     for _answer in answers(controller, inbox_of(controller), [(RUN_CTRL.frame_id, payload)]):
         pass

@@ -24,10 +24,10 @@ from controller import node
 from controller.calibration import Calibration
 from controller.interface import fault_names
 from controller.registry import is_file, load_law
-from plant_sim.scenario import FOLDER, Loaded, load, members
+from plant_sim.scenario import FOLDER, Loaded, at_rate, load, members
 from tools import environment, hil, line, record, setup, sil, sil_faults
 from tools.files import write_json, write_text
-from tools.frames import LineDigest
+from tools.frames import LineDigest, timetable_rate
 from tools.hil import RunError
 from tools.lyapunov import has_lyapunov, lyapunov
 from tools.observer import CONTROLLER, PATIENCE_S, PLANT, measured_truth
@@ -295,6 +295,9 @@ def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
             _set_digest(session, digest.hex(), digest.of_trains())
             run, seconds = results[0].run, results[0].seconds
             if writer is not None:
+                reference = _own_reference(session, frames)
+                if reference is not None:
+                    writer.reference(run, reference)
                 for train, result in enumerate(results):
                     writer.frames(run, result.frames, train)
                     writer.faults(run, result.injected, train)
@@ -318,6 +321,20 @@ def _runs_in_process(
     return sil_faults.run_line(
         loaded, nodes, runs=session.runs, seed=seed, plan=session.plan, progress=progress
     )
+
+
+def _own_reference(session: Session, frames: list[np.ndarray]) -> Any:
+    """The reference of a run on a timetable of its own, as a record array for the trace; None for
+    the planned one."""
+    rate = timetable_rate(frames[0])
+    if rate == 0:
+        return None
+    profile = at_rate(session.loaded, rate).profile
+    kind = [(name, np.float64) for name in ("position_m", "speed_m_s", "acceleration_m_s2")]
+    table = np.zeros(len(profile.x), kind)
+    for name, _type in kind:
+        table[name] = getattr(profile, name)
+    return table.view(np.recarray)
 
 
 def _own_columns(
@@ -496,6 +513,11 @@ def _on_run(
         truths = [measured_truth(frames[0], led["ticks"], period_s)]
     else:
         truths = list(np.load(led["file"]))
+        reference = _own_reference(session, frames)
+        if reference is not None:
+            file = kept / f"reference_{run}.npy"
+            np.save(file, reference)
+            tap.command(command="reference", run=run, file=str(file))
         tap.command(command="truth", run=run, file=led["file"])
         for number, table in enumerate(_own_columns(session, frames, truths)):
             file = kept / f"columns_{run}_{number}.npy"

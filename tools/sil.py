@@ -175,6 +175,7 @@ def run_line(
     for number in runs:
         if progress:
             progress(number, 0)
+        here.prepare(number)
         _announce(here, nodes, plant.ARMED, number)
         here.begin(here.params, here.state)
         chance = world.chances(here, number)

@@ -95,6 +95,7 @@ def run_line(
     for number in runs:
         if progress:
             progress(number, 0)
+        here.prepare(number)
         _announce(here, sides, plant.ARMED, number)
         if watch:
             watch.begin(number)

@@ -7,7 +7,8 @@ beside it in a branch of its own:
     /bus/state/run_NN/LANE  states and faults, a row a change
     /bus/frames/run_NN      every frame of a tick as it was: identifiers and payloads
     /truth/FIELD/run_NN     true state of the plant, and its errors against the reference
-    /reference/FIELD        the reference
+    /reference/FIELD        the reference as planned
+    /reference/FIELD/run_NN that of a run on a timetable of its own
     /runs/KEY               the summary of each run, on timeline `run`
     /events                 texts
 
@@ -125,6 +126,7 @@ PLOTS = (
             Line(ATO_STATUS, "Iteration", "controller", ORANGE),
         ),
     ),
+    Plot("timetable_rate", "", (Line(RUN_CTRL, "TimetableRate", "announced, less 1", BLUE),)),
     Plot(
         "neighbour_position",
         "m",
@@ -288,6 +290,7 @@ class TraceWriter:
         self._names = tuple(names)
         self._trains, self._spacing_m = trains, spacing_m
         self._reference = reference
+        self._references: dict[int, Reference] = {}  # of runs on a timetable of their own
         self._cars = cars
         self._estimates = tuple(estimates)
         self._plots = (*PLOTS, _car_force_plot(cars)) if cars else PLOTS
@@ -312,10 +315,7 @@ class TraceWriter:
         except RuntimeError as error:
             raise TraceError(f"{path}: cannot write the trace: {error}") from None
         self._stream.send_recording_name(title)
-        for field in ("position_m", "speed_m_s", "acceleration_m_s2"):
-            values = getattr(reference, field)[:, None]
-            index = self._index(np.arange(len(values)))
-            self._log_scalars(f"reference/{field}", index, values, ["reference"], [ORANGE])
+        self._log_reference("", reference)
 
     def frames(self, run: int, frames: np.ndarray, train: int = 0) -> None:
         """Log FRAME rows of whole ticks; the batches of a train's run follow one another.
@@ -351,6 +351,17 @@ class TraceWriter:
             self._log_lane(run, train, lane, *found[lane.message.name])
         self._log_frames(run, train, frames)
 
+    def reference(self, run: int, reference: Reference) -> None:
+        """Log the reference of a run on a timetable of its own; before its truth."""
+        self._references[run] = reference
+        self._log_reference(f"/{self._run_name(run)}", reference)
+
+    def _log_reference(self, branch: str, reference: Reference) -> None:
+        for field in ("position_m", "speed_m_s", "acceleration_m_s2"):
+            values = getattr(reference, field)[:, None]
+            index = self._index(np.arange(len(values)))
+            self._log_scalars(f"reference/{field}{branch}", index, values, ["reference"], [ORANGE])
+
     def truth(self, run: int, table: np.ndarray, train: int = 0) -> None:
         """Log the true state of the plant: a structured array of float64 fields, a row a tick.
 
@@ -371,7 +382,7 @@ class TraceWriter:
         for error, field in ERRORS.items():
             if field not in (table.dtype.names or ()):
                 continue  # a column of its own, such as the Lyapunov function
-            reference = getattr(self._reference, field)
+            reference = getattr(self._references.get(run, self._reference), field)
             if field == "position_m":
                 reference = reference - train * self._spacing_m
             count = min(len(table), len(reference))

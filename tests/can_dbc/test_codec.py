@@ -282,13 +282,16 @@ REFUSED: list[tuple[str, list[tuple[str, str]], str]] = [
     ),
     (
         "RUN_CTRL",
-        [("SG_ Iteration : 20|12@1+", "SG_ Iteration : 20|33@1+")],
+        [
+            ("SG_ Iteration : 20|12@1+", "SG_ Iteration : 20|33@1+"),
+            ("SG_ TimetableRate : 32|24@1-", "SG_ TimetableRate : 53|11@1-"),
+        ],
         "RUN_CTRL.Iteration must be an integer of at most 32 bits, offset 0",
     ),
     (
         "RUN_CTRL",
-        [("BO_ 144 RUN_CTRL: 8", "BO_ 144 RUN_CTRL: 5")],
-        "message RUN_CTRL has 5 bytes, expected 8",
+        [("BO_ 144 RUN_CTRL: 8", "BO_ 144 RUN_CTRL: 7")],
+        "message RUN_CTRL has 7 bytes, expected 8",
     ),
     (
         "RUN_CTRL",

@@ -242,6 +242,25 @@ def status(sent):
 # Run control.
 
 
+def test_the_timetable_goes_at_the_rate_that_arming_announced(bench):
+    """Half as fast: the reference of two ticks is that of one, its speed half of it."""
+
+    def references(rate, ticks):
+        bench.put(RUN_CTRL, RunState=ARMED, Iteration=1, TimetableRate=rate)
+        bench.cycle(0)
+        bench.counters, bench.tick = [0] * MESSAGE_COUNT, 0
+        rows = []
+        for _ in range(ticks):
+            bench.run_tick()  # its RUN_CTRL says 0: the rate of a run stays
+            rows.append((bench.inputs["reference_position"], bench.inputs["reference_speed"]))
+        return np.array(rows)
+
+    planned, slow = references(0, 200), references(-(2**23), 400)
+    assert planned[-1, 1] > 1000
+    assert (slow[::2, 0] == planned[:, 0]).all()
+    assert np.abs(2 * slow[::2, 1] - planned[:, 1]).max() <= 1
+
+
 def test_arming_is_answered_with_state_and_iteration(bench):
     for iteration in (1, 2, 4095):
         answer = status(bench.control(ARMED, iteration))

@@ -169,6 +169,17 @@ def test_run_control_comes_every_hundred_milliseconds():
     assert rig.sent(RUN_CTRL, "Iteration") == 7
 
 
+def test_run_control_tells_the_timetable_s_rate():
+    rig = Rig()
+    for rate in (-(2**23), -5, 0, 2**23 - 1):
+        rig.node["timetable_rate"] = rate
+        rig.node["tick"] = 0
+        rig.sense()
+        assert rig.sent(RUN_CTRL, "TimetableRate") == rate / 2**24
+        plant.announce(rig.node, plant.ARMED, 1, rig.here.tx[0])
+        assert rig.sent(RUN_CTRL, "TimetableRate") == rate / 2**24
+
+
 def test_the_tick_wraps_at_sixteen_bits():
     rig = Rig()
     rig.node["tick"] = 65536 + 5

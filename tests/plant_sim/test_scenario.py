@@ -104,6 +104,14 @@ MISTAKES = [
     ('base = "nowhere"', r"key `base`: scenario 'nowhere' is unknown, expected one of .*subway.*"),
     ('base = "missing.toml"', r"key `base`: .*/missing\.toml: no such scenario file"),
     ('title = "x"', r"Object missing required field `law`"),
+    (
+        'base = "crh3-learning"\n[run_length]\nreading = "early"',
+        r"key run_length: reading is 'early', expected cut or stretched",
+    ),
+    (
+        'base = "crh3-learning"\n[run_length]\nreading = "stretched"\nshortest_s = 1200.0',
+        r"\[run_length\]: 120000 ticks are not 2/3 to 2 times the planned 250000",
+    ),
     ('base = "subway"\nrun = 3', r"Object contains unknown field `run`"),
     ('base = "subway"\nruns = 0', r"key runs: 0, expected 1 or more"),
     (

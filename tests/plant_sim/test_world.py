@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plant_sim import actuator, world
-from plant_sim.scenario import load
+from plant_sim.scenario import at_rate, load
 
 NOISE = "[sensors]\nspeed_noise_m_s = 0.005\n"
 LOAD = "[disturbance]\namplitude_m_s2 = 0.01\n"
@@ -101,6 +101,45 @@ def test_the_first_run_may_have_a_length_of_its_own(variant):
     plain = variant(LENGTHS, "plain")
     assert world.run_ticks(loaded, 1, 1) == 17_322  # both ends included
     assert world.run_ticks(loaded, 1, 2) == world.run_ticks(plain, 1, 2)
+
+
+STRETCHED = LENGTHS + 'reading = "stretched"\n'
+
+
+def test_a_stretched_run_lasts_as_long_as_its_timetable(variant):
+    """190 s as planned; the same lengths as those of runs that are cut, where these are shorter."""
+    loaded, cut = variant(STRETCHED + "first_s = 173.21\n"), variant(LENGTHS, "cut")
+    ticks = np.array([world.run_ticks(loaded, 1, run) for run in range(1, 200)])
+    assert ticks[0] == 17_322
+    assert (ticks.min(), ticks.max()) == pytest.approx((15_000, 21_000), abs=500)
+    cut_ticks = np.array([world.run_ticks(cut, 1, run) for run in range(1, 200)])
+    assert (np.minimum(ticks, 19_001) == cut_ticks)[1:].all()
+    rates = np.array([world.timetable_rate(loaded, 1, run) for run in range(1, 200)])
+    assert 19_000 / (1 + rates / 2**24) == pytest.approx(ticks - 1, abs=0.02)
+
+
+def test_without_stretch_the_timetable_is_as_planned(variant):
+    for text in ("", LENGTHS):
+        assert world.timetable_rate(variant(text, f"mine{len(text)}"), 1, 3) == 0
+
+
+def test_a_run_s_limits_go_with_its_timetable(variant):
+    """Those over time are reached earlier or later; those above the reference follow it."""
+    for text in ("", "[profile]\nlimits = []\nlimit_above_m_s = 0.5\n"):
+        loaded = variant(STRETCHED + text, f"mine{len(text)}")
+        here = world.build(loaded, 1)
+        here.prepare(2)
+        rate = world.timetable_rate(loaded, 1, 2)
+        assert set(here.state["node"]["timetable_rate"]) == {rate}
+        run = at_rate(loaded, rate)
+        planned = world.limits_of(loaded)
+        if text:
+            at = np.searchsorted(here.limits["until_tick"], np.arange(run.ticks))
+            assert (here.limits["speed_m_s"][at] == run.profile.speed_m_s + 0.5).all()
+            assert here.limits["speed_m_s"].max() != planned["speed_m_s"].max()
+        else:
+            factor = here.limits["until_tick"] / planned["until_tick"]
+            assert factor == pytest.approx((run.ticks - 1) / 19_000, abs=2e-4)
 
 
 def test_chance_does_not_depend_on_when_the_run_ends(variant):

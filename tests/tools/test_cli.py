@@ -6,6 +6,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from plant_sim.scenario import scenario_names
@@ -102,6 +103,24 @@ def test_the_profile_has_the_limit_that_follows_the_reference(ato_hil, tmp_path:
     for line in lines[1::10_000]:
         _tick, _position, speed, _acceleration, permitted = map(float, line.split(","))
         assert permitted - speed == pytest.approx(2 / 3.6, abs=2e-7)
+
+
+def test_the_profile_of_a_run_is_on_its_own_timetable(ato_hil, short_text, tmp_path: Path) -> None:
+    """Run 1 takes 24 s instead of 20 s, and is as much slower."""
+    lengths = "[run_length]\nshortest_s = 18.0\nlongest_s = 25.0\nfirst_s = 24.0\n"
+    (tmp_path / "late.toml").write_text(f'{short_text}\n{lengths}reading = "stretched"\n')
+    tables = []
+    for options in ((), ("--run", "1")):
+        done = ato_hil("profile", "late.toml", *options, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        lines = done.stdout.splitlines()[1:]
+        tables.append(np.array([list(map(float, line.split(","))) for line in lines]))
+    planned, late = tables
+    assert (planned[-1, 0], late[-1, 0]) == (2000, 2400)
+    assert late[-1, 1:4].tolist() == planned[-1, 1:4].tolist()
+    assert late[::6, 1] == pytest.approx(planned[::5, 1], abs=1e-4)
+    assert late[::6, 2] == pytest.approx(planned[::5, 2] / 1.2, abs=1e-4)
+    assert late[::6, 4].tolist() == planned[::5, 4].tolist()
 
 
 @pytest.mark.long

@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rerun.chunk import RrdReader
 
 from tools.cli import Mode, Screen
+from tools.replay import prepare, replay
 from tools.session import Options, SessionError, run
 
 
@@ -78,6 +80,43 @@ def test_runs_of_different_length_are_no_fault(ato_hil, short_text, tmp_path: Pa
     assert [row["faults"] for row in other["runs"]] == [[], [], []]
     assert other["controller"] == one["controller"]
     assert one["controller"]["memory_bytes"] > 0
+
+
+def test_a_stretched_timetable_is_that_of_both_nodes_and_of_the_summary(
+    ato_hil, record_session, silent, short_text, tmp_path: Path
+) -> None:
+    """Announced on the bus: the train is where its own timetable has it, and not the planned one;
+    a recording replays."""
+    path = tmp_path / "late.toml"
+    path.write_text(
+        short_text + "\n[run_length]\nshortest_s = 18.0\nlongest_s = 25.0\nfirst_s = 24.0\n"
+        'reading = "stretched"\n'
+    )
+    options = Options(
+        *(str(path), None, 2, "sil", "none", 1, tmp_path / "sil", None),
+        trace=True,
+        record=tmp_path / "sil.log",
+    )
+    one = run(options, silent)
+    hil = ato_hil(
+        *("run", str(path), "--bus", channel(tmp_path), "--out", "hil", "--record", "hil.log"),
+        cwd=tmp_path,
+    )
+    assert hil.returncode == 0, hil.stderr
+    other = summary(tmp_path / "hil")
+    assert one["digest"] == other["digest"]
+    assert one["runs"][0]["ticks"] == 2401
+    assert one["runs"][1]["ticks"] != 2401
+    planned = record_session(tmp_path, "planned.log", 1)["runs"][0]
+    for row in (*one["runs"], *other["runs"]):
+        assert row["faults"] == []
+        assert row["max_position_error_m"] < 2 * planned["max_position_error_m"] < 0.1
+    for name in ("sil", "hil"):
+        trace = RrdReader(str(tmp_path / name / "trace.rrd"))
+        entities = {chunk.entity_path for chunk in trace.stream()}
+        assert {"/reference/speed_m_s/run_01", "/reference/position_m/run_02"} <= entities
+    results = list(replay(prepare(tmp_path / "hil.log")))
+    assert [result.difference for result in results] == [None, None]
 
 
 def test_the_summary_has_its_stable_keys(ato_hil, short: Path, tmp_path: Path) -> None:

@@ -303,6 +303,26 @@ def test_truth_and_its_errors_against_the_reference(tmp_path: Path) -> None:
         assert logged.tolist() == getattr(REFERENCE, field).tolist()
 
 
+def test_a_run_on_its_own_timetable_has_its_own_reference(tmp_path: Path) -> None:
+    """Its errors are against that; those of the other runs against the planned one."""
+    own = SimpleNamespace(**{name: 1.5 * column for name, column in vars(REFERENCE).items()})
+    table = np.zeros(TICKS, TRUTH)
+    writer = open_writer(tmp_path / "trace.rrd")
+    writer.truth(1, table)
+    writer.reference(2, own)
+    writer.truth(2, table)
+    writer.close()
+    written = Trace(tmp_path / "trace.rrd")
+    for run, reference in ((1, REFERENCE), (2, own)):
+        error = written.values(f"/truth/position_error_m/run_0{run}")[:, 0]
+        assert error.tolist() == (-reference.position_m).tolist()
+    for field in ("position_m", "speed_m_s", "acceleration_m_s2"):
+        logged = written.values(f"/reference/{field}/run_02")[:, 0]
+        assert logged.tolist() == getattr(own, field).tolist()
+        logged = written.values(f"/reference/{field}")[:, 0]
+        assert logged.tolist() == getattr(REFERENCE, field).tolist()
+
+
 def test_a_run_longer_than_the_reference_has_errors_as_far_as_that_goes(tmp_path: Path) -> None:
     writer = open_writer(tmp_path / "trace.rrd")
     writer.truth(1, np.zeros(TICKS + 5, TRUTH))

@@ -21,6 +21,7 @@ from can_dbc.step import step
 from controller import firmware, memory, node
 from controller.interface import FAULTS_THAT_BLOCK_LEARNING
 from controller.registry import is_file, law_step, load_law
+from plant_sim import world
 from plant_sim.scenario import Loaded, load, members
 from tools import setup, sil
 from tools.verify import ABSENT, FAILED, Row, identity, row
@@ -137,7 +138,8 @@ def _runs(
     drive: int,
 ) -> tuple[float, list[np.ndarray]]:
     """Largest difference of the force (m/s^2), and the truth of each run, [trains, ticks]."""
-    pairs = [_pair(module, reference, train, law, drive) for train in members(loaded)]
+    ticks = max(world.run_ticks(loaded, identity.SEED, run) for run in numbers)
+    pairs = [_pair(module, reference, train, law, drive, ticks) for train in members(loaded)]
     truth = []
     kept = [pair.state["law"]["real"]["memory"].copy() for pair in pairs]
     for results in sil.run_line(loaded, pairs, runs=numbers, seed=identity.SEED):
@@ -152,9 +154,9 @@ def _runs(
 
 
 def _pair(
-    module: ModuleType, reference: Reference, loaded: Loaded, law: str, drive: int
+    module: ModuleType, reference: Reference, loaded: Loaded, law: str, drive: int, ticks: int
 ) -> node.Controller:
-    """A controller with both forms of the law."""
+    """A controller with both forms of the law, for runs of at most so many ticks."""
     calibration = setup.calibration_for(loaded, law)
     scenario = loaded.scenario
     gains = msgspec.convert(scenario.laws[law], module.Gains, strict=False)
@@ -168,7 +170,7 @@ def _pair(
     params["law"]["real"] = real
     params["law"]["drive"] = drive
 
-    state = np.zeros(1, firmware.state_dtype(pair_state_dtype(module, reference, loaded.ticks)))
+    state = np.zeros(1, firmware.state_dtype(pair_state_dtype(module, reference, ticks)))
     state["links"]["counter"] = -1
     if reference.words:
         state["law"]["real"]["memory"] = reference.initial(gains, vehicle) or 0.0
