@@ -42,8 +42,8 @@ SLOW_TICKS = 20
 
 
 class MemorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Grid of the learning memory; a law that recalls the last run has one int32 cell a tick,
-    whatever this says."""
+    """Grid of the learning memory; a law that recalls the last run has one int32 cell a tick, one
+    that learns along the track an int32 cell every pitch of its own, whatever this says."""
 
     decimation: int = 1  # control periods a cell
     lead_ticks: int = 0
@@ -135,6 +135,7 @@ def calibrate(
         params["law"] = module.calibrate(typed, vehicle)
         words = _words(module, typed, vehicle)
         recall = module.recall(typed) if hasattr(module, "recall") else None
+        pitch_m = module.pitch_m(typed) if hasattr(module, "pitch_m") else None
     except (msgspec.ValidationError, CalibrationError) as error:
         raise CalibrationError(f"laws.{law_label(law)}: {error}") from None
     params["gradient_map"] = gradient_map.calibrate(map_sections)
@@ -147,6 +148,7 @@ def calibrate(
     ticks = int(profile["ticks"].sum()) + 1
     if recall is not None:
         preview_ticks = recall.ahead_ticks
+    if recall is not None or pitch_m is not None:
         memory_settings = MemorySettings()
     params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
     if line is not None:
@@ -154,6 +156,8 @@ def calibrate(
     params["memory"] = _memory(words, memory_settings, ticks)
     if recall is not None:
         _recall(params["memory"], recall)
+    if pitch_m is not None:
+        _along_track(params["memory"], pitch_m, profile)
     if car_effectiveness:
         try:
             params["distribution"] = distribution.calibrate(
@@ -365,6 +369,14 @@ def _recall(params: np.ndarray, recall: Recall) -> None:
     params["smooth_word"] = recall.smooth_word
     params["smooth_weight"] = round(2**30 / (2 * recall.smooth_ticks + 1))
     params["late_word"] = recall.late_word
+
+
+def _along_track(params: np.ndarray, pitch_m: float, profile: np.ndarray) -> None:
+    """Lays the cells of `_memory` along the track, from where the profile starts to where it
+    ends."""
+    pitch = fixed("pitch_m", pitch_m, Q_POSITION)
+    params["pitch"] = pitch
+    params["cells"] = (reference.length(profile) >> 25) // pitch + 1
 
 
 def save(calibration: Calibration, path: Path) -> None:

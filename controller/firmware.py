@@ -445,7 +445,7 @@ def build_tick(law_step: Any) -> Any:
         stands = int64(inputs.reference_speed) == 0 and int64(inputs.ahead_speed) == 0
         state.seen.timetable_stands = 1 if stands else 0
 
-        memory.gather(params.memory, state.memory, cells, state.cell)
+        memory.gather(params.memory, state.memory, cells, state.cell, int64(inputs.position))
         law_step(params.law, state.law, state.cell, inputs, state.outputs)
         memory.scatter(params.memory, state.memory, cells, state.cell)
 

@@ -12,6 +12,10 @@ A law may instead recall the last run (`Recall`): each tick's `learn` then repla
 held, one cell a tick, and the law sees besides `before` the first words of a later tick (`ahead`)
 and a zero-phase moving average of one word (`smooth`), both of the last run throughout.
 
+Or its words lie along the track, a cell every `pitch`, and not along time: triangular memberships
+delta of the two cells around the train, which sum to 1. `before` is their sum weighted by delta,
+and each takes its share delta of `learn` at once, so that a run goes on with what it learns.
+
 Contract: `gather` and `scatter` are steps of bounded time that run inside the tick; `start_run`,
 `end_run` run between runs. The caller owns every buffer.
 """
@@ -28,6 +32,7 @@ from controller.q import INT32_MAX, clamp, divide_round, round_shift, sat32
 WORDS_MAX = 22
 AHEAD_WORDS = 2
 SMOOTH_MAX = 64  # ticks either side
+ONE = 1 << 30  # Q30
 
 CELL = np.dtype(
     [
@@ -55,7 +60,7 @@ MEMORY_PARAMS = np.dtype(
         ("smooth_word", np.int32),  # recall: the word that it averages
         ("smooth_weight", np.int32),  # 2^30 / (2 smooth + 1)
         ("late_word", np.int32),  # recall: words from here on are of the tick before
-        ("padding", np.int32),
+        ("pitch", np.int32),  # along the track: m, Q15, from cell to cell; 0: along time
         ("low", np.int32, (WORDS_MAX,)),  # bounds of a value
         ("high", np.int32, (WORDS_MAX,)),
         ("initial", np.int32, (WORDS_MAX,)),  # value of every cell before the first run
@@ -69,7 +74,7 @@ MEMORY_STATE = np.dtype(
         ("window", np.int64),  # recall: sum of the word that is averaged
         ("generation", np.int32),  # which half is read, 0 or 1
         ("read_cell", np.int32),
-        ("read_phase", np.int32),  # tick inside the cell that is read
+        ("read_phase", np.int32),  # tick inside the cell that is read; along the track: delta, Q30
         ("write_cell", np.int32),
         ("write_phase", np.int32),  # ticks summed in the cell that is written
         ("wait", np.int32),  # ticks until the first increment has somewhere to go
@@ -125,10 +130,50 @@ def recall(params: Any, state: Any, memory: Any, cell: Any) -> None:
 
 
 @step
-def gather(params: Any, state: Any, memory: Any, cell: Any) -> None:
-    """`cell.before` for the current tick, and the read position one tick on."""
+def gather_along(params: Any, state: Any, memory: Any, cell: Any, position: Any) -> None:
+    """`cell.before` at `position`; before the first and beyond the last cell, that cell's."""
+    pitch = max(int64(params.pitch), int64(1))
+    last = int64(params.cells) - 1
+    place = clamp(position, int64(0), last * pitch)
+    here = place // pitch
+    ahead = min(here + 1, last)
+    delta = ((place - here * pitch) << 30) // pitch  # of the cell ahead, below 1
+    live = 1 - int64(state.generation)
+    for w in range(WORDS_MAX):
+        if w < int64(params.words):
+            near = int64(memory[live, here, w])
+            far = int64(memory[live, ahead, w])
+            cell.before[w] = sat32(near + round_shift((far - near) * delta, 30))
+    state.read_cell = here
+    state.read_phase = delta
+
+
+@step
+def scatter_along(params: Any, state: Any, memory: Any, cell: Any) -> None:
+    """Shares `cell.learn` between the two cells that `gather_along` has read."""
+    here = int64(state.read_cell)
+    ahead = min(here + 1, int64(params.cells) - 1)
+    delta = int64(state.read_phase)
+    live = 1 - int64(state.generation)
+    for w in range(WORDS_MAX):
+        if w < int64(params.words):
+            low = int64(params.low[w])
+            high = int64(params.high[w])
+            learn = int64(cell.learn[w])
+            near = int64(memory[live, here, w]) + round_shift(learn * (ONE - delta), 30)
+            memory[live, here, w] = clamp(near, low, high)
+            far = int64(memory[live, ahead, w]) + round_shift(learn * delta, 30)
+            memory[live, ahead, w] = clamp(far, low, high)
+
+
+@step
+def gather(params: Any, state: Any, memory: Any, cell: Any, position: Any) -> None:
+    """`cell.before` for the current tick, with the train at `position` (m, Q15), and the read
+    position one tick on."""
     words = int64(params.words)
-    if words > 0:
+    if int64(params.pitch) > 0:
+        gather_along(params, state, memory, cell, position)
+    elif words > 0:
         generation = int64(state.generation)
         decimation = int64(params.decimation)
         here = int64(state.read_cell)
@@ -164,7 +209,9 @@ def gather(params: Any, state: Any, memory: Any, cell: Any) -> None:
 def scatter(params: Any, state: Any, memory: Any, cell: Any) -> None:
     """Takes `cell.learn` of the current tick; closes the cell with its last tick."""
     words = int64(params.words)
-    if words > 0:
+    if int64(params.pitch) > 0:
+        scatter_along(params, state, memory, cell)
+    elif words > 0:
         if int64(state.wait) > 0:
             state.wait = int64(state.wait) - 1
         else:
@@ -227,6 +274,7 @@ def end_run(params: np.void, state: np.void, memory: np.ndarray, keep: bool) -> 
     that is read."""
     if int(params["words"]) == 0:
         return
-    close_cell(params, state, memory)
+    if int(params["pitch"]) == 0:
+        close_cell(params, state, memory)
     if keep:
         state["generation"] = 1 - int(state["generation"])

@@ -93,8 +93,8 @@ Quadruple = tuple[float, float, float, float]
 Bounds = tuple[float, float]
 
 
-class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Gains as in the paper, SI; forces are those of a kilogram."""
+class CommonGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Gains of this law and of `afilc_track`, SI; forces are those of a kilogram."""
 
     beta: float  # 1/s
     psi1: float  # 1/s
@@ -109,6 +109,11 @@ class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     rho_max: NotNegative  # m/s^2
     feedforward: bool = False  # h is added
     eps: NotNegative = 0.0  # m/s, half the boundary layer; 0: sgn
+
+
+class Gains(CommonGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Gains as in the paper."""
+
     multiple: Quadruple = (-3.0, 1.0, -1.0, 2.0)  # centres, times the reference
     centre_m: Quadruple = (0.0, 0.0, 0.0, 0.0)  # and so much on top
     sigma_m: tuple[Length, Length, Length, Length] = (50.0, 30.0, 35.0, 40.0)
@@ -220,10 +225,9 @@ def increments(params: Any, state: Any, alpha: Any, v: Any, v2: Any, cell: Any) 
 
 
 @step
-def switching(params: Any, phi: Any) -> Any:
-    """sgn(phi), or sat(phi / eps), Q30."""
+def switching(phi: Any, inverse_eps: Any) -> Any:
+    """sgn(phi), or sat(phi / eps), Q30; 1 / eps in Q16, 0: sgn."""
     one = int64(1) << 30
-    inverse_eps = int64(params.inverse_eps)
     if inverse_eps != 0:
         return clamp((phi * inverse_eps) >> 10, -one, one)
     return one if phi > 0 else (-one if phi < 0 else int64(0))
@@ -257,7 +261,8 @@ def afilc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None
     wanted += round_shift(int64(outputs.estimate[2]) * v2, 30)
     for rule in range(RULES):
         wanted += round_shift(int64(outputs.estimate[3 + rule]) * int64(state.delta[rule]), 30)
-    wanted += round_shift(int64(outputs.estimate[7]) * switching(params, phi), 30)
+    sign = switching(phi, int64(params.inverse_eps))
+    wanted += round_shift(int64(outputs.estimate[7]) * sign, 30)
     if int64(params.feedforward) == 1:
         wanted += int64(inputs.ahead_acceleration) << 3
     force_max = int64(params.force_max)

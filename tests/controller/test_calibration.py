@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from controller import calibration, distribution
+from controller import calibration, distribution, reference
 from controller.calibration import GuardSettings, Line, MemorySettings
 from controller.memory import initial_memory
 from controller.neighbours import NeighbourSettings
@@ -107,6 +107,38 @@ def test_words_that_do_not_learn_are_not_stored():
     params = calibrate(gains=CAILC | {"Gamma": [1e5, 0.0, 0.0]}).params[0]["memory"]
     assert params["words"] == 1
     assert params["initial"][1] == round(172.808613 / 194295.0 * 2**39)
+
+
+TRACK = {
+    "beta": 0.4,
+    "psi1": 0.15,
+    "kv": 0.25,
+    "Gamma": [2e-3, 1e-7, 1e-10],
+    "Gamma_w": 0.2,
+    "kappa": 0.01,
+    "a": [0.0, 0.012],
+    "b": [0.0, 3.5e-4],
+    "c": [0.0, 2e-5],
+    "w": [-0.13, 0.13],
+    "rho_max": 0.03,
+}
+
+
+def test_rules_along_the_track_are_as_many_as_pitches_fit_on_it():
+    """Whatever the grid over time is."""
+    settings = MemorySettings(decimation=16, lead_ticks=32, storage="int16")
+    profile = np.array([(400, 0), (1000, 25_000), (1001, -25_000)], SEGMENT)
+    end_m = reference.length(profile) / 2**40
+    gains = TRACK | {"pitch_m": end_m / 6.5}
+    made = calibrate(law="afilc-track", gains=gains, profile=profile, memory_settings=settings)
+    memory = made.params[0]["memory"]
+    assert (memory["cells"], memory["words"], memory["scale"]) == (7, 5, 1)
+    assert memory["pitch"] == round(end_m / 6.5 * 2**15)
+    assert made.memory_dtype == "int32"
+    alone = gains | {"Gamma": [0.0, 0.0, 0.0], "kappa": 0.0}
+    made = calibrate(law="afilc-track", gains=alone, profile=profile)
+    assert initial_memory(made.params[0]["memory"]).nbytes == 2 * 7 * 4
+    assert calibrate(law="cailc").params[0]["memory"]["pitch"] == 0
 
 
 def test_cars_get_their_distribution():

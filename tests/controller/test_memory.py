@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc.step import step
+from can_dbc.step import int64, step
 from controller import memory
 from controller.memory import CELL, MEMORY_PARAMS, MEMORY_STATE, WORDS_MAX
 
@@ -22,7 +22,7 @@ def run_ticks(params: Any, state: Any, stored: Any, cell: Any, learn: Any, befor
     """One run: learn [ticks, words] goes in, before [ticks, words] comes out."""
     memory.rewind(params[0], state[0], stored, cell[0])
     for k in range(len(learn)):
-        memory.gather(params[0], state[0], stored, cell[0])
+        memory.gather(params[0], state[0], stored, cell[0], int64(0))
         for w in range(learn.shape[1]):
             before[k, w] = cell[0].before[w]
             cell[0].learn[w] = learn[k, w]
@@ -258,7 +258,7 @@ def test_a_law_without_words_uses_no_memory():
     mine = Memory(settings_of(words=0, cells=0))
     assert mine.stored.size == 0
     cell = np.full(CELL.itemsize // 4, 7, np.int32).view(CELL)
-    memory.gather(mine.params[0], mine.state[0], mine.stored, cell[0])
+    memory.gather(mine.params[0], mine.state[0], mine.stored, cell[0], 0)
     memory.scatter(mine.params[0], mine.state[0], mine.stored, cell[0])
     memory.end_run(mine.params[0], mine.state[0], mine.stored, True)
     assert (cell["before"] == 7).all()
@@ -278,8 +278,8 @@ def test_no_value_overflows(interpreted, values, learned, grid):
         each.stored[:] = np.array(values).reshape(2, 2, 1)
     cells = [np.zeros(1, CELL), np.zeros(1, CELL)]
     for increment in learned:
-        memory.gather(params[0], mine.state[0], mine.stored, cells[0][0])
-        interpreted("controller.memory:gather", params, checked.state, checked.stored, cells[1])
+        memory.gather(params[0], mine.state[0], mine.stored, cells[0][0], 0)
+        interpreted("controller.memory:gather", params, checked.state, checked.stored, cells[1], 0)
         for cell in cells:
             cell["learn"][0, 0] = increment
         memory.scatter(params[0], mine.state[0], mine.stored, cells[0][0])
@@ -307,7 +307,7 @@ def recall_ticks(params: Any, state: Any, stored: Any, cell: Any, learn: Any, se
     memory.rewind(params[0], state[0], stored, cell[0])
     words = learn.shape[1]
     for k in range(len(learn)):
-        memory.gather(params[0], state[0], stored, cell[0])
+        memory.gather(params[0], state[0], stored, cell[0], int64(0))
         for w in range(words):
             seen[k, w] = cell[0].before[w]
             cell[0].learn[w] = learn[k, w]
@@ -387,7 +387,128 @@ def test_no_recalled_value_overflows(interpreted):
     memory.rewind(params[0], mine.state[0], mine.stored, cells[0][0])
     interpreted("controller.memory:rewind", params, checked.state, checked.stored, cells[1])
     for _ in range(3):
-        memory.gather(params[0], mine.state[0], mine.stored, cells[0][0])
-        interpreted("controller.memory:gather", params, checked.state, checked.stored, cells[1])
+        memory.gather(params[0], mine.state[0], mine.stored, cells[0][0], 0)
+        interpreted("controller.memory:gather", params, checked.state, checked.stored, cells[1], 0)
     assert cells[0] == cells[1]
     assert abs(int(cells[0]["smooth"][0]) + 2**31) <= 2 * memory.SMOOTH_MAX + 2
+
+
+# A law that learns along the track.
+
+PITCH = 4 << 15
+
+
+@step
+def track_ticks(
+    params: Any, state: Any, stored: Any, cell: Any, position: Any, learn: Any, before: Any
+) -> None:
+    """One run: position [ticks] and learn [ticks, words] go in, before [ticks, words] comes out."""
+    memory.rewind(params[0], state[0], stored, cell[0])
+    for k in range(len(learn)):
+        memory.gather(params[0], state[0], stored, cell[0], position[k])
+        for w in range(learn.shape[1]):
+            before[k, w] = cell[0].before[w]
+            cell[0].learn[w] = learn[k, w]
+        memory.scatter(params[0], state[0], stored, cell[0])
+
+
+def along(cells=3, words=1, **settings):
+    params = settings_of(words=words, cells=cells, **settings)
+    params["pitch"] = PITCH
+    return params
+
+
+class Along(Memory):
+    def run(self, positions, learn, keep=True):
+        """`positions` in Q15."""
+        learn = np.array(learn, np.int64).reshape(-1, int(self.params["words"][0]))
+        before = np.zeros(learn.shape, np.int64)
+        memory.start_run(self.state[0], self.stored)
+        places = np.array(positions, np.int64)
+        cell = np.zeros(1, CELL)
+        track_ticks(self.params, self.state, self.stored, cell, places, learn, before)
+        memory.end_run(self.params[0], self.state[0], self.stored, keep)
+        return before
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(-PITCH, 4 * PITCH), st.integers(-(2**24), 2**24)),
+        min_size=1,
+        max_size=12,
+    ),
+    st.lists(st.integers(-(2**26), 2**26), min_size=4, max_size=4),
+    st.integers(2**22, 2**27),
+)
+def test_the_two_cells_around_a_place_share_what_it_teaches(ticks, initial, bound):
+    mine = Along(along(cells=4, low=-bound, high=bound))
+    model = [Fraction(min(max(value, -bound), bound)) for value in initial]
+    mine.stored[:] = np.array(model).astype(np.int64).reshape(1, 4, 1)
+    found = mine.run(*zip(*ticks, strict=True))
+    for count, ((position, learn), before) in enumerate(zip(ticks, found.ravel(), strict=True)):
+        place = min(max(Fraction(position, PITCH), 0), 3)
+        delta = [max(0, 1 - abs(place - cell)) for cell in range(4)]
+        assert sum(delta) == 1
+        seen = sum(d * value for d, value in zip(delta, model, strict=True))
+        assert abs(int(before) - seen) <= count + 1 + Fraction(bound, 2**29)  # delta is rounded
+        model = [
+            min(max(value + d * learn, -bound), bound)
+            for d, value in zip(delta, model, strict=True)
+        ]
+    for (value,), exact in zip(mine.values, model, strict=True):
+        assert abs(value - exact) <= len(ticks)
+
+
+def test_a_run_goes_on_with_what_it_has_just_learned():
+    mine = Along(along())
+    before = mine.run([PITCH, PITCH, PITCH + PITCH // 2, 2 * PITCH], [100, 20, 8, 0])
+    assert before.ravel().tolist() == [0, 100, 60, 4]
+    assert mine.values == [[0], [124], [4]]
+
+
+def test_beyond_its_ends_the_track_has_the_first_and_the_last_cell():
+    mine = Along(along())
+    mine.run([-5 * PITCH, 9 * PITCH, -(2**31), 2**31 - 1], [1, 10, 2, 20])
+    assert mine.values == [[3], [0], [30]]
+
+
+def test_a_dropped_run_leaves_nothing_along_the_track():
+    mine = Along(along(initial=7))
+    mine.run([PITCH, 2 * PITCH], [50, 60], keep=False)
+    assert mine.values == [[7], [7], [7]]
+    assert mine.run([PITCH], [0]).ravel().tolist() == [7]
+
+
+def test_every_word_along_the_track_has_its_own_value_and_bounds():
+    params = along(words=2)
+    params["low"][0, :2], params["high"][0, :2] = (-5, -50), (5, 50)
+    mine = Along(params)
+    mine.run([0, PITCH], [[9, 9], [-9, -90]])
+    assert mine.values == [[5, 9], [-5, -50], [0, 0]]
+
+
+@given(
+    st.lists(INT32, min_size=6, max_size=6),
+    st.lists(
+        st.tuples(INT32, INT32 | st.sampled_from([-(2**31), 2**31 - 1])), min_size=2, max_size=2
+    ),
+    st.sampled_from([1, PITCH, 2**31 - 1]),
+)
+def test_no_value_along_the_track_overflows(interpreted, values, ticks, pitch):
+    params = along()
+    params["pitch"] = pitch
+    mine, checked = Along(params), Along(params)
+    for each in (mine, checked):
+        each.stored[:] = np.array(values).reshape(2, 3, 1)
+    cells = [np.zeros(1, CELL), np.zeros(1, CELL)]
+    for place, learn in ticks:
+        memory.gather(params[0], mine.state[0], mine.stored, cells[0][0], place)
+        arguments = (params, checked.state, checked.stored, cells[1])
+        interpreted("controller.memory:gather", *arguments, place)
+        for cell in cells:
+            cell["learn"][0, 0] = learn
+        memory.scatter(params[0], mine.state[0], mine.stored, cells[0][0])
+        interpreted("controller.memory:scatter", *arguments)
+    assert cells[0] == cells[1]
+    assert (mine.stored == checked.stored).all()
+    assert mine.state == checked.state

@@ -18,7 +18,7 @@ from can_dbc.step import int64, step
 from controller import calibration, node
 from controller.laws import afilc
 from plant_sim import track, world
-from plant_sim.scenario import load
+from plant_sim.scenario import at_rate, load
 from tools import setup, sil
 from tools.claims.afilc import (
     FAULTS,
@@ -33,10 +33,12 @@ from tools.claims.afilc import (
     last_ten,
     of,
     overspeed_bound_km_h,
+    stretched,
 )
 from tools.claims.table import variant
 from tools.verify.references import afilc as reference
 
+STRETCHED = "crh3-learning-stretched"
 LIT, LITT, MIN, REV = (
     "crh3-learning-paper",
     "crh3-learning-boxed",
@@ -268,6 +270,69 @@ def test_a_whole_run_over_the_bus_has_the_bits_of_sil(tmp_path):
         assert summary["controller"]["memory_bytes"] == 2 * 32 * 15_626
         digests.append(summary["digest"])
     assert digests[0] == digests[1]
+
+
+# Stretched timetables: a moment of the run is no longer a place of the track.
+
+
+def test_runs_on_stretched_timetables_end_at_the_stop():
+    """Early and late ones; the lengths are those of the runs that are cut."""
+    loaded = load(STRETCHED)
+    ticks = [world.run_ticks(loaded, 1, run) for run in range(1, 61)]
+    assert ticks[0] == 247_301
+    assert min(ticks) >= 240_001
+    assert 250_001 < max(ticks) <= 260_001
+    for run in (1, 2, 3):
+        own = at_rate(loaded, world.timetable_rate(loaded, 1, run))
+        assert own.ticks == ticks[run - 1]
+        assert own.profile.position_m[-1] == loaded.profile.position_m[-1]
+        assert own.profile.speed_m_s.max() == pytest.approx(50 * 250_000 / (own.ticks - 1), 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("case", "rules", "words"), [("", 205, 5), (":fine", 409, 5), (":weights", 205, 1)]
+)
+def test_the_memory_along_the_track_is_small(case, rules, words):
+    """820 bytes a generation for the weights alone, 4.1 kB for the whole law."""
+    made = node.build(setup.calibration_for(load(STRETCHED + case), "afilc-track"))
+    assert made.memory_bytes == 2 * 4 * rules * words
+
+
+@pytest.mark.long
+def test_learning_by_place_serves_stretched_timetables():
+    """Measured MEASURED_HERE."""
+    by_time, by_place, fine, weights, fine_weights = (
+        stretched(case, law)
+        for case, law in [
+            ("", "afilc"),
+            ("", "afilc-track"),
+            (":fine", "afilc-track"),
+            (":weights", "afilc-track"),
+            (":weights-fine", "afilc-track"),
+        ]
+    )
+    assert falls_to(by_time, POSITION) > 0.3
+    assert falls_to(by_place, POSITION) <= 0.08
+    assert falls_to(fine, POSITION) <= 0.06
+    assert falls_to(weights, POSITION) <= 0.162
+    assert falls_to(fine_weights, POSITION) <= 0.086
+    assert last_ten(by_place, POSITION) < 0.1 * last_ten(by_time, POSITION)
+    assert last_ten(by_place, SPEED) < 0.4 * last_ten(by_time, SPEED)
+    for runs in (by_time, by_place, fine, weights, fine_weights):
+        assert runs["ticks"].tolist() == by_time["ticks"].tolist()
+        assert largest(runs, "faults") == 0
+        assert largest(runs, "barrier_ratio") < 1
+        assert largest(runs, "force_ratio") <= 0.65
+
+
+@pytest.mark.long
+def test_learning_by_place_needs_no_lead():
+    """All imperfections, lag of 0.4 s among them, over 200 runs."""
+    runs = of(STRETCHED, FAULTS, law="afilc-track", count=200)
+    assert falls_to(runs, POSITION) <= 0.08
+    assert last_ten(runs, SPEED) <= 1.1 * float(np.mean(runs[SPEED][50:60]))
+    assert runs["force_step_m_s2"][-1] <= 0.002
+    assert largest(runs, "overspeed_km_h") <= 1.1
 
 
 # What must be seen to fail.

@@ -13,10 +13,11 @@ import msgspec
 import numpy as np
 
 from controller.laws.afilc import Gains
-from plant_sim.scenario import Loaded, load
+from plant_sim.scenario import Loaded, at_rate, load
 from plant_sim.trains import point
 from tools import setup, sil
 from tools.claims.table import Claim, variant
+from tools.frames import timetable_rate
 
 RUNS = 100
 
@@ -83,8 +84,9 @@ def figures(loaded: Loaded, result: sil.RunResult) -> tuple[float, ...]:
     """One row of FIGURES."""
     scenario, truth = loaded.scenario, result.truth
     ticks = len(truth)
-    e1 = loaded.profile.position_m[:ticks] - truth["position_m"]
-    e2 = loaded.profile.speed_m_s[:ticks] - truth["speed_m_s"]
+    reference = at_rate(loaded, timetable_rate(result.frames)).profile
+    e1 = reference.position_m[:ticks] - truth["position_m"]
+    e2 = reference.speed_m_s[:ticks] - truth["speed_m_s"]
     window = int(scenario.metrics.to_s / scenario.period_s) + 1
     gains = gains_of(loaded)
     force_n = sil.commanded_force_n(result.frames, ticks)
@@ -180,6 +182,14 @@ def boxed(text: str = "") -> np.ndarray:
     return of("crh3-learning-boxed", text, count=21)
 
 
+STRETCHED_RUNS = 60
+
+
+def stretched(case: str = "", law: str = "afilc-track") -> np.ndarray:
+    """Early and late runs on stretched timetables, errors against the run's own."""
+    return of("crh3-learning-stretched" + case, law=law, count=STRETCHED_RUNS)
+
+
 POSITION, SPEED = "position_rms_m", "speed_rms_m_s"
 
 CLAIMS = [
@@ -230,4 +240,14 @@ CLAIMS = [
           lambda: largest(boxed(LAG), "overspeed_km_h")),
     Claim("252 km/h, everything on (ours): position falls to", "-", "", 0, 0.05, True,
           lambda: falls_to(of("crh3-express"), POSITION)),
+    Claim("stretched timetables, 60 runs, learned by time as the paper does: position falls to",
+          "yes", "", 0, 0.2, False, lambda: falls_to(stretched(law="afilc"), POSITION)),
+    Claim("the same, learned by place every 256 m (ours)", "yes", "", 0, 0.08, True,
+          lambda: falls_to(stretched(), POSITION)),
+    Claim("the same every 128 m", "yes", "", 0, 0.06, True,
+          lambda: falls_to(stretched(":fine"), POSITION)),
+    Claim("one number every 256 m, 820 bytes: position falls to", "-", "", 0, 0.162, True,
+          lambda: falls_to(stretched(":weights"), POSITION)),
+    Claim("one number every 128 m: position falls to", "-", "", 0, 0.086, True,
+          lambda: falls_to(stretched(":weights-fine"), POSITION)),
 ]  # fmt: skip

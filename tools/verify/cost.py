@@ -236,7 +236,7 @@ def memory_loop(n: Any, params: Any, state: Any, cells: Any) -> None:
     """Gather and scatter, from the start of a run."""
     memory.rewind(params[0].memory, state[0].memory, cells, state[0].cell)
     for _ in range(n):
-        memory.gather(params[0].memory, state[0].memory, cells, state[0].cell)
+        memory.gather(params[0].memory, state[0].memory, cells, state[0].cell, int64(0))
         memory.scatter(params[0].memory, state[0].memory, cells, state[0].cell)
 
 

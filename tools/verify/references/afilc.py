@@ -1,4 +1,5 @@
-"""The laws of paper 4 in float64: (3)-(8), (15)-(26), and (71)-(73), as in `controller/laws/`."""
+"""The laws of paper 4 in float64: (3)-(8), (15)-(26), in both readings of the rules, and (71)-(73),
+as in `controller/laws/`."""
 
 from __future__ import annotations
 
@@ -83,6 +84,22 @@ def regressor(p: Any, own: Any, s: Any, v: Any, p1: Any, p2: Any) -> None:
 
 
 @step
+def barrier(phi: Any, kv: Any) -> Any:
+    """alpha of (18)."""
+    w = max(1.0 - min(abs(phi) / kv, 1.0) ** 2, afilc.W_MIN)
+    sine = math.sin(0.5 * math.pi * w)
+    return limited(phi / (sine * sine), -ERROR_MAX, ERROR_MAX)
+
+
+@step
+def switching(phi: Any, eps: Any) -> Any:
+    """sat(phi / eps), or sgn(phi) for 0."""
+    if eps > 0.0:
+        return limited(phi / eps, -1.0, 1.0)
+    return 1.0 if phi > 0.0 else (-1.0 if phi < 0.0 else 0.0)
+
+
+@step
 def control(p: Any, own: Any, before: Any, inputs: Any) -> Any:
     """F of (18); own.learn is what (20) and (23) add to `before`, own.theta the projected sum."""
     p1, p2 = q15(inputs.reference_position), q24(inputs.reference_speed)
@@ -90,9 +107,7 @@ def control(p: Any, own: Any, before: Any, inputs: Any) -> Any:
     e1 = limited(p1 - s, -ERROR_MAX, ERROR_MAX)
     e2 = limited(p2 - v, -ERROR_MAX, ERROR_MAX)
     phi = limited(p.psi1 * e1 + e2, -ERROR_MAX, ERROR_MAX)
-    w = max(1.0 - min(abs(phi) / p.kv, 1.0) ** 2, afilc.W_MIN)
-    sine = math.sin(0.5 * math.pi * w)
-    alpha = limited(phi / (sine * sine), -ERROR_MAX, ERROR_MAX)
+    alpha = barrier(phi, p.kv)
     regressor(p, own, s, v, p1, p2)
     for word in range(7):
         own.learn[word] = p.gamma[word] * own.xi[word] * alpha
@@ -102,10 +117,7 @@ def control(p: Any, own: Any, before: Any, inputs: Any) -> Any:
     force = p.beta * phi + p.psi1 * e2
     for word in range(7):
         force += own.theta[word] * own.xi[word]
-    if p.eps > 0.0:
-        force += own.theta[7] * limited(phi / p.eps, -1.0, 1.0)
-    elif phi != 0.0:
-        force += own.theta[7] if phi > 0.0 else -own.theta[7]
+    force += own.theta[7] * switching(phi, p.eps)
     force += p.feedforward * q27(inputs.ahead_acceleration)
     return limited(force, -p.force_max, p.force_max)
 
@@ -117,6 +129,77 @@ def _afilc_force(p: Any, state: Any, inputs: Any) -> Any:
     for word in range(8):
         memory[word] = state.own.theta[word]
     return force
+
+
+# Rules along the track: a row of the memory is a rule.
+
+TRACK_PARAMS = np.dtype(
+    [
+        ("beta", np.float64),
+        ("psi1", np.float64),
+        ("kv", np.float64),
+        ("eps", np.float64),
+        ("feedforward", np.float64),
+        ("rate", np.float64, (5,)),  # of w, rho, a, b, c in a tick
+        ("low", np.float64, (5,)),
+        ("high", np.float64, (5,)),
+        ("pitch", np.float64),
+        ("force_max", np.float64),
+    ]
+)
+# Value and regressor of each word in one tick.
+TRACK_OWN = np.dtype([("word", np.float64, (5,)), ("xi", np.float64, (5,))])
+
+
+def _track_params(gains: Any, vehicle: Vehicle) -> np.ndarray:
+    values = np.zeros(1, TRACK_PARAMS)
+    for name in ("beta", "psi1", "kv", "eps", "feedforward"):
+        values[name] = getattr(gains, name)
+    values["rate"] = vehicle.period_s * np.array([gains.Gamma_w, gains.kappa, *gains.Gamma])
+    bounds = (gains.w, (0.0, gains.rho_max), gains.a, gains.b, gains.c)
+    values["low"], values["high"] = zip(*bounds, strict=True)
+    values["pitch"], values["force_max"] = gains.pitch_m, vehicle.force_max_m_s2
+    return values
+
+
+def _track_initial(gains: Any, vehicle: Vehicle) -> tuple[float, ...]:
+    values = _track_params(gains, vehicle)
+    return tuple(np.clip(0.0, values["low"][0], values["high"][0]).tolist())
+
+
+@step
+def _share(p: Any, own: Any, rule: Any, delta: Any, alpha: Any) -> None:
+    """What a rule of membership `delta` adds to the words, and learns."""
+    for word in range(5):
+        own.word[word] += delta * rule[word]
+        error = abs(alpha) if word == 1 else alpha
+        learned = rule[word] + p.rate[word] * own.xi[word] * error * delta
+        rule[word] = limited(learned, p.low[word], p.high[word])
+
+
+@step
+def _afilc_track_force(p: Any, state: Any, inputs: Any) -> Any:
+    p1, p2 = q15(inputs.reference_position), q24(inputs.reference_speed)
+    s, v = q15(inputs.position), q24(inputs.speed)
+    e2 = limited(p2 - v, -ERROR_MAX, ERROR_MAX)
+    phi = limited(p.psi1 * limited(p1 - s, -ERROR_MAX, ERROR_MAX) + e2, -ERROR_MAX, ERROR_MAX)
+    alpha = barrier(phi, p.kv)
+    own = state.own
+    for word in range(5):
+        own.word[word] = 0.0
+        own.xi[word] = 1.0
+    speed = limited(v, -SPEED_MAX, SPEED_MAX)
+    own.xi[3] = speed
+    own.xi[4] = speed * speed
+    place = max(s / p.pitch, 0.0)
+    here = math.floor(place)
+    _share(p, own, state.memory[here], here + 1 - place, alpha)
+    _share(p, own, state.memory[here + 1], place - here, alpha)
+    force = p.beta * phi + p.psi1 * e2 + p.feedforward * q27(inputs.ahead_acceleration)
+    force += own.word[1] * switching(phi, p.eps)
+    for word in (0, 2, 3, 4):
+        force += own.word[word] * own.xi[word]
+    return limited(force, -p.force_max, p.force_max)
 
 
 # (71)-(73)
@@ -152,6 +235,16 @@ _P_ILC = ("K1", "K2", "feedforward", "constant", "linear", "square", "force_max"
 # Bounds: one LSB of the force on the bus is 1/16 N, of the position 31 um.
 REFERENCES: dict[str, Reference] = {
     "afilc": Reference(params, OWN, _afilc_force, 20.0, 1e-4, 1e-4, words=8, initial=initial),
+    "afilc-track": Reference(
+        _track_params,
+        TRACK_OWN,
+        _afilc_track_force,
+        20.0,
+        1e-4,
+        1e-4,
+        words=5,
+        initial=_track_initial,
+    ),
     "p-ilc": Reference(
         recorded(_P_ILC, _p_ilc_params),
         np.dtype([("unused", np.float64)]),
