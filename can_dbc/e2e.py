@@ -149,31 +149,33 @@ def send(node: Any, tx: Any, message: Any, word: Any) -> None:
 
 @step
 def check(word: Any, last_counter: Any, data_id: Any) -> Any:
-    """OK, REPEATED, LOST or CORRUPT, for who has no bound for jumps of the counter; `last_counter`
-    is that of the last good frame, -1 if there was none."""
-    return verdict(word, last_counter, data_id, DELTA_ANY)
-
-
-@step
-def verdict(word: Any, last_counter: Any, data_id: Any, delta_max: Any) -> Any:
-    """OK, REPEATED, LOST, WRONG_SEQUENCE or CORRUPT; `last_counter` is that of the last frame whose
-    CRC fitted, -1 if there was none; the counter may jump by `delta_max`."""
+    """OK, REPEATED, LOST or CORRUPT, however far the counter jumped; `last_counter` is that of the
+    last frame whose CRC fitted, -1 if there was none."""
     found = word & 0xFF
     counter = (word >> 8) & 15
     nibble = (word >> 12) & 15
     expected = crc(word, int64(_CRC_DATA_ID[data_id & 0xFF]))
     if found != expected or nibble != ((data_id >> 8) & 15) or counter >= COUNTER_PERIOD:
         return int64(CORRUPT)
-    delta = counter - last_counter
+    if last_counter < 0:
+        return int64(OK)
+    if counter == last_counter:
+        return int64(REPEATED)
+    if counter != next_counter(last_counter):
+        return int64(LOST)
+    return int64(OK)
+
+
+@step
+def verdict(word: Any, last_counter: Any, data_id: Any, delta_max: Any) -> Any:
+    """What `check` finds, and WRONG_SEQUENCE if the counter jumped by more than `delta_max`."""
+    found = check(word, last_counter, data_id)
+    delta = ((word >> 8) & 15) - last_counter
     if delta < 0:
         delta += COUNTER_PERIOD
-    if last_counter < 0 or delta == 1:
-        return int64(OK)
-    if delta == 0:
-        return int64(REPEATED)
-    if delta > delta_max:
+    if found == LOST and delta > delta_max:
         return int64(WRONG_SEQUENCE)
-    return int64(LOST)
+    return found
 
 
 @step

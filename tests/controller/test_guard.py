@@ -494,7 +494,7 @@ def test_a_target_is_judged_as_by_exact_arithmetic(
     """But for rounding, which is below 0.05 m/s of speed and 1 m of way."""
     time_s = ahead * Fraction(round(0.01 * 2**30), 2**30)
     target = Fraction(target_speed, V)
-    reached = Fraction(speed, V) + max(Fraction(acceleration, A), 0) * time_s
+    reached = Fraction(speed, V) + Fraction(max(acceleration, 0), A) * time_s
     reached = min(reached, Fraction(INT32_MAX, V))
     now = seen(
         speed=speed, target_speed=target_speed, target_distance=distance, acceleration=acceleration
