@@ -123,7 +123,7 @@ CORE_STATE = np.dtype(
         ("guard", np.int32),
         ("force", np.int32),  # total force sent, N Q4
         ("map_section", np.int32),  # of the gradient map
-        ("padding", np.int32),
+        ("stamp", np.int32),  # Tick of the last TRAIN_POSITION
         ("car_force", np.int32, (distribution.CARS_MAX,)),  # N Q4
         # Next end-to-end counter of each message sent; an even number, so that nothing is padded.
         ("sent", np.int32, (MESSAGE_COUNT + MESSAGE_COUNT % 2,)),
@@ -186,6 +186,7 @@ def begin(params: Any, profile: Any, state: Any, cells: Any, rate: Any) -> None:
     core.guard = GUARD_NORMAL
     core.force = 0
     core.map_section = 0
+    core.stamp = 0
     for i in range(MESSAGE_COUNT):
         core.sent[i] = 0
         e2e.begin_link(state.links[i])
@@ -235,6 +236,13 @@ def receive(setting: Any, state: Any, rx: Any, message: Any) -> Any:
 
 
 @step
+def stamp_age(core: Any) -> Any:
+    """Ticks since the plant measured the position, by its Tick; 0 if that lies ahead."""
+    age = (int64(core.tick) - int64(core.stamp)) & TICK_MASK
+    return age if age <= TICK_MASK >> 1 else int64(0)
+
+
+@step
 def read_inputs(params: Any, state: Any, rx: Any) -> None:
     """Measurements, limit and tick from the mailboxes that pass their check; the others keep their
     last value."""
@@ -251,7 +259,8 @@ def read_inputs(params: Any, state: Any, rx: Any) -> None:
     if position_is_new != 0:
         word = int64(rx[TRAIN_POSITION.index].payload)
         inputs.position = get(word, TRAIN_POSITION.Position) << _POSITION_SHIFT
-        if get(word, TRAIN_POSITION.Tick) != (int64(core.tick) & TICK_MASK):
+        core.stamp = get(word, TRAIN_POSITION.Tick)
+        if int64(core.stamp) != (int64(core.tick) & TICK_MASK):
             core.faults = int64(core.faults) | FAULT_TICK
     if receive(params.every_tick, state, rx, ATP_LIMIT) != 0:
         word = int64(rx[ATP_LIMIT.index].payload)
@@ -263,7 +272,7 @@ def read_inputs(params: Any, state: Any, rx: Any) -> None:
         seen.supervision = get(word, ATP_LIMIT.Supervision)
     seen.speed = inputs.speed
     seen.speed_age = e2e.age(state.links[TRAIN_SPEED.index])
-    seen.position_age = e2e.age(state.links[TRAIN_POSITION.index])
+    seen.position_age = max(e2e.age(state.links[TRAIN_POSITION.index]), stamp_age(core))
     seen.limit_age = e2e.age(state.links[ATP_LIMIT.index])
     seen.control_age = e2e.age(state.links[RUN_CTRL.index])
     core.faults = int64(core.faults) | plausibility.faults_of_samples(

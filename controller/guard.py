@@ -8,7 +8,8 @@ scenario may set) may hold a law's brake back, but never a brake of the guard.
 REACTIONS says which fault leads to what. A reaction to a fault stays until the next run begins.
 Besides, by the speed of now:
 
-    too fast by overspeed_margin, or for the target within cut_ahead     no traction, while it is so
+    too fast by overspeed_margin, or for the target within cut_ahead,    no traction, while it is so
+      or ATP warns
     too fast by brake_margin, or for the target within brake_ahead       service brake, until the
                                                                          speed is permitted again
     too fast by emergency_margin, or ATP demands an emergency brake      emergency request, until
@@ -21,10 +22,10 @@ FORCE_CMD then says: Mode hold or emergency_request, else coast, traction or bra
 
 Bounds, in ticks from the cause to the FORCE_CMD with the reaction (`reaction_ticks` gives them as
 numbers): a message that no longer comes, age_max + 1 after its last good frame (RUN_CTRL:
-control_age_max + 1); one that is corrupt more often than its link's state machine tolerates, no
-later than that; what a frame itself says (speed, supervision, quality, an implausible value), 0:
-the FORCE_CMD of the tick that received it. Position and speed that disagree: as in
-`plausibility.py`.
+control_age_max + 1), and a position whose Tick is as old; one that is corrupt more often than its
+link's state machine tolerates, no later than that; what a frame itself says (speed, supervision,
+quality, an implausible value), 0: the FORCE_CMD of the tick that received it. Position and speed
+that disagree: as in `plausibility.py`.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ FAULTS_THAT_BRAKE = sum(
 )
 
 # Supervision and Quality, as in ATP_LIMIT and TRAIN_SPEED.
-ATP_SERVICE_BRAKE, ATP_EMERGENCY_BRAKE = 2, 3
+ATP_WARNING, ATP_SERVICE_BRAKE, ATP_EMERGENCY_BRAKE = 1, 2, 3
 SENSOR_INVALID = 2
 NO_TARGET = 65535  # TargetDistance of ATP_LIMIT
 
@@ -114,7 +115,7 @@ PARAMS = np.dtype(
 SEEN = np.dtype(
     [
         ("speed_age", np.int32),  # ticks since the last good frame of TRAIN_SPEED
-        ("position_age", np.int32),  # of TRAIN_POSITION
+        ("position_age", np.int32),  # of TRAIN_POSITION, or by its Tick if that is more
         ("limit_age", np.int32),  # of ATP_LIMIT
         ("control_age", np.int32),  # of RUN_CTRL
         ("speed", np.int32),  # m/s, Q24
@@ -246,6 +247,8 @@ def stands(params: Any, seen: Any) -> Any:
 @step
 def must_cut(params: Any, seen: Any) -> Any:
     """1 if there may be no traction."""
+    if int64(seen.supervision) >= ATP_WARNING:
+        return int64(1)
     return is_above(seen, int64(params.overspeed_margin)) | is_too_fast_for_target(
         params, seen, int64(params.cut_ahead)
     )

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from controller import calibration, distribution, reference
-from controller.calibration import GuardSettings, Line, MemorySettings
+from controller.calibration import GuardSettings, Line, MemorySettings, PlausibleSettings
 from controller.memory import initial_memory
 from controller.neighbours import NeighbourSettings
 from controller.quantise import CalibrationError, Vehicle, fixed
 from controller.rebasing import RebasingSettings
-from controller.reference import SEGMENT
+from controller.reference import CURSOR, REFERENCE_PARAMS, SEGMENT, advance, rewind
 from controller.registry import LawError, law_names, law_number, load_law
 
 CAILC = {
@@ -84,6 +84,78 @@ def test_the_parameters_hold_the_settings():
     assert memory["initial"][0] == round(2439.62458 / 194295.0 * 2**34)
     assert params["distribution"]["cars"] == 0
     assert (made.profile == PROFILE).all()
+
+
+def test_limits_that_are_not_stated_are_off():
+    guard = calibrate().params[0]["guard"]
+    most, least = 2**31 - 1, -(2**31)
+    for name in ("brake_margin", "emergency_margin", "traction_max", "acceleration_max"):
+        assert guard[name] == most
+    assert (guard["brake_max"], guard["hold_brake"], guard["force_step"]) == (least, 0, 2**32)
+    assert (guard["cut_ahead"], guard["brake_ahead"]) == (0, 0)
+    assert guard["target_brake"] == -guard["service_brake"] == round(0.8 * 2**27)
+    assert guard["period"] == round(0.01 * 2**30)
+
+
+def test_the_guard_holds_the_settings():
+    settings = GuardSettings(
+        emergency_brake_m_s2=1.0,
+        hold_brake_m_s2=0.25,
+        brake_margin_m_s=1.0,
+        emergency_margin_m_s=2.0,
+        cut_ahead_s=1.5,
+        brake_ahead_s=0.5,
+        target_brake_m_s2=0.5,
+        traction_max_m_s2=1.0,
+        brake_max_m_s2=1.5,
+        jerk_max_m_s3=0.5,
+        acceleration_max_m_s2=0.75,
+    )
+    guard = calibrate(guard_settings=settings).params[0]["guard"]
+    assert (guard["emergency_brake"], guard["hold_brake"]) == (-(2**27), -(2**25))
+    assert (guard["brake_margin"], guard["emergency_margin"]) == (2**24, 2**25)
+    assert (guard["cut_ahead"], guard["brake_ahead"], guard["target_brake"]) == (150, 50, 2**26)
+    assert (guard["traction_max"], guard["brake_max"]) == (2**27, -3 * 2**26)
+    assert (guard["force_step"], guard["acceleration_max"]) == (round(0.005 * 2**27), 3 * 2**25)
+
+
+def test_an_emergency_brake_is_no_weaker_than_the_service_brake():
+    settings = GuardSettings(service_brake_m_s2=1.5, emergency_brake_m_s2=1.2)
+    guard = calibrate(guard_settings=settings).params[0]["guard"]
+    assert guard["emergency_brake"] == guard["service_brake"]
+
+
+def test_positions_are_believed_around_the_timetable():
+    length = calibration.length_m(PROFILE)
+    settings = GuardSettings(plausible=PlausibleSettings(position_margin_m=100.0))
+    believed = calibrate(guard_settings=settings).params[0]["plausibility"]
+    assert believed["position_min"] == -100 * 2**15
+    assert believed["position_max"] == round((length + 100) * 2**15)
+    own = Line(-500.0, 500.0, True, True, NeighbourSettings())
+    believed = calibrate(guard_settings=settings, line=own).params[0]["plausibility"]
+    assert believed["position_min"] == -600 * 2**15
+    wide = GuardSettings(plausible=PlausibleSettings(position_margin_m=1e6))
+    believed = calibrate(guard_settings=wide).params[0]["plausibility"]
+    assert (believed["position_min"], believed["position_max"]) == (-(2**31), 2**31 - 1)
+
+
+def test_the_length_of_a_profile_is_where_its_cursor_ends():
+    params, cursor = np.zeros(1, REFERENCE_PARAMS), np.zeros(1, CURSOR)
+    params["segment_count"] = len(PROFILE)
+    rewind(cursor[0], PROFILE, 0)
+    for _ in range(600):
+        advance(params[0], cursor[0], PROFILE)
+    assert calibration.length_m(PROFILE) == cursor["x"][0] / 2**40
+
+
+def test_links_that_miss_frames_for_less_than_the_largest_age_stay_valid():
+    for age, few in ((1, 3), (10, 3), (11, 3), (12, 2), (13, 1), (14, 0), (1000, 0)):
+        settings = GuardSettings(age_max_ticks=age, counter_jump_max=7)
+        params = calibrate(guard_settings=settings).params[0]
+        assert params["every_tick"]["valid_ok_min"] == few
+        assert params["every_tick"]["init_ok_min"] == max(few, 1)
+        assert params["every_tick"]["delta_max"] == params["slow"]["delta_max"] == 7
+        assert params["slow"]["valid_ok_min"] == 0
 
 
 def test_a_brake_is_a_brake_whatever_its_sign():
@@ -297,6 +369,30 @@ def test_wrong_memory_settings_are_refused_with_their_key(settings, message):
             "control.guard.overspeed_margin_m_s: 128 is outside what the firmware holds, +-128",
         ),
         ({"age_max_ticks": 0}, "control.guard.age_max_ticks is 0, expected 1 to 1000"),
+        (
+            {"counter_jump_max": 15},
+            "control.guard.counter_jump_max is 15, expected 1 to 14",
+        ),
+        (
+            {"cut_ahead_s": -1.0},
+            "control.guard.cut_ahead_s in ticks is -100, expected 0 to 10000",
+        ),
+        (
+            {"jerk_max_m_s3": 1e4},
+            "control.guard.jerk_max_m_s3: 100 is outside what the firmware holds, +-16",
+        ),
+        (
+            {"plausible": PlausibleSettings(speed_max_m_s=128.0)},
+            "control.guard.plausible.speed_max_m_s: 128 is outside what the firmware holds, +-128",
+        ),
+        (
+            {"plausible": PlausibleSettings(progress_max_m=-1.0)},
+            "control.guard.plausible.progress_max_m is -1, expected 0 or more",
+        ),
+        (
+            {"plausible": PlausibleSettings(window_s=0.0)},
+            "control.guard.plausible.window_s in ticks is 0, expected 1 to 1000",
+        ),
         (
             {"age_max_ticks": 2**40},
             "control.guard.age_max_ticks is 1099511627776, expected 1 to 1000",

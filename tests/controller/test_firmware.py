@@ -534,6 +534,14 @@ def test_a_jump_of_the_tick_is_reported(running, jump):
     assert running.core["guard"] == GUARD_NORMAL
 
 
+def test_a_position_that_is_always_late_is_lost(running):
+    """Counter and CRC are right, and a frame comes in every tick; its Tick tells."""
+    for late, lost in ((1, 0), (AGE_MAX, 0), (AGE_MAX + 1, FAULT_POSITION_LOST)):
+        running.run_tick(tick=running.tick - late)
+        assert running.core["faults"] == FAULT_TICK | lost
+    assert running.core["guard"] == GUARD_SERVICE_BRAKE
+
+
 @pytest.mark.parametrize("permitted", [0.01, 0.7, 1.0, 22.6, 163.83])
 def test_overspeed_is_reported_from_the_first_step_of_the_sensor(running, permitted):
     step = TRAIN_SPEED.Speed.scale
@@ -571,7 +579,7 @@ def test_a_limited_command_is_told_to_the_law(running):
 
 def test_atp_brakes_the_train(running):
     running.run_tick(supervision=1)
-    assert running.core["guard"] == GUARD_NORMAL
+    assert (running.core["guard"], running.core["faults"]) == (GUARD_COAST, 0)
     running.run_tick(supervision=2)
     assert running.core["faults"] == FAULT_ATP
     assert running.core["guard"] == GUARD_SERVICE_BRAKE

@@ -252,6 +252,11 @@ def check_what_is_done_about_the_target(guard: Any) -> None:
         assert guard.state_of(setting, state(), now, 0) == expected, distance
 
 
+def check_a_warning_of_atp_cuts_traction(guard: Any) -> None:
+    for supervision, expected in ((0, GUARD_NORMAL), (1, GUARD_COAST), (2, GUARD_COAST)):
+        assert guard.state_of(params(), state(), seen(supervision=supervision), 0) == expected
+
+
 def check_the_service_brake_stays_until_the_speed_is_permitted(guard: Any) -> None:
     setting = params(overspeed_margin=V, brake_margin=2 * V)
     kept = state()
@@ -282,7 +287,7 @@ def check_the_service_brake_stays_while_traction_would_be_cut(guard: Any) -> Non
 def check_an_emergency_request_stays_until_the_train_stands(guard: Any) -> None:
     kept = state()
     for supervision, speed, expected in (
-        (2, 10 * V, GUARD_NORMAL),
+        (2, 10 * V, GUARD_COAST),
         (3, 10 * V, GUARD_EMERGENCY),
         (0, 10 * V, GUARD_EMERGENCY),
         (0, STANDSTILL + 1, GUARD_EMERGENCY),
