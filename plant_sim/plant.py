@@ -31,7 +31,7 @@ from can_dbc.codec import (
     saturate,
 )
 from can_dbc.step import int64, step
-from plant_sim import actuator, radio
+from plant_sim import actuator, atp, brakes, radio
 from plant_sim.mail import received
 
 IDLE, ARMED, RUNNING, ENDED = 0, 1, 2, 3
@@ -39,13 +39,17 @@ CONTROL_PERIOD_TICKS = 10  # RUN_CTRL comes every so many ticks
 NO_TARGET_M = 65535
 TICK_MASK = 0xFFFF
 CARS_MAX = 8
-EMERGENCY_BRAKE = choices("ATP_LIMIT", "Supervision")["emergency_brake"]
+HOLD = choices("FORCE_CMD", "Mode")["hold"]
+EMERGENCY_REQUEST = choices("FORCE_CMD", "Mode")["emergency_request"]
 
-LIMIT = np.dtype(
-    [
-        ("until_tick", np.int64),  # last tick of this limit
-        ("speed_m_s", np.float64),
-    ]
+# Of ATP: where it steps in, and what it demands, as in ATP_LIMIT; NaN where nothing of the kind is
+# supervised.
+ATP_COLUMNS = (
+    "warning_speed_m_s",
+    "service_brake_speed_m_s",
+    "emergency_brake_speed_m_s",
+    "emergency_deceleration_speed_m_s",  # EBD
+    "supervision",
 )
 
 # Row k of a run: the state at the start of tick k, and what was applied over it.
@@ -60,6 +64,7 @@ TRUTH = np.dtype(
         ("braking_j", np.float64),  # work taken up by braking, likewise
         ("recuperated_j", np.float64),  # what of it came back
         ("coupler_force_n", np.float64),  # largest of any coupler over tick k; 0 for rigid trains
+        *((name, np.float64) for name in ATP_COLUMNS),
     ]
 )
 
@@ -93,6 +98,7 @@ NODE_PARAMS = np.dtype(
         ("brake_to", np.int64),
         ("brake_m_s2", np.float64),  # deceleration that it holds
         ("brake_supervision", np.int64),  # what ATP says meanwhile
+        ("command_age_max", np.int64),  # ticks without a valid command until the vehicle brakes
     ],
     align=True,
 )
@@ -103,13 +109,14 @@ NODE_STATE = np.dtype(
         ("iteration", np.int64),
         ("tick", np.int64),
         ("timetable_rate", np.int64),  # of the run, less 1, 2^-24
-        ("limit", np.int64),  # index of the limit in force
-        ("permitted_speed_m_s", np.float64),
         (
             "command_n",
             np.float64,
             (CARS_MAX,),
         ),  # last valid command: channel 0 the total, or each car
+        ("command_age", np.int64),  # ticks since all of the command was last valid
+        ("mode", np.int64),  # of the last valid FORCE_CMD
+        ("emergency_requested", np.int64),  # 1: by the controller, until standstill
         ("refused", np.int64),  # frames that failed the end-to-end check
         ("sent", np.int64, (MESSAGE_COUNT,)),  # next end-to-end counter
         ("received", np.int64, (MESSAGE_COUNT,)),  # last end-to-end counter, -1: none
@@ -125,6 +132,8 @@ def params_dtype(train_params: np.dtype) -> np.dtype:
             ("node", NODE_PARAMS),
             ("radio", radio.PARAMS),
             ("actuator", actuator.PARAMS),
+            ("atp", atp.PARAMS),
+            ("brakes", brakes.PARAMS),
             ("train", train_params),
         ],
         align=True,
@@ -138,6 +147,8 @@ def state_dtype(train_state: np.dtype) -> np.dtype:
             ("node", NODE_STATE),
             ("radio", radio.STATE),
             ("actuator", actuator.STATE),
+            ("atp", atp.STATE),
+            ("brakes", brakes.STATE),
             ("train", train_state),
         ],
         align=True,
@@ -181,7 +192,9 @@ def begin_node(node: Any) -> None:
     """A run starts: tick 0, end-to-end counters at 0."""
     node.run_state = RUNNING
     node.tick = 0
-    node.limit = 0
+    node.command_age = 0
+    node.mode = 0
+    node.emergency_requested = 0
     node.refused = 0
     for i in range(MESSAGE_COUNT):
         node.sent[i] = 0
@@ -205,28 +218,63 @@ def raw_of(signal: Any, value: Any) -> Any:
 
 
 @step
+def raw_below(signal: Any, value: Any) -> Any:
+    """Raw value of a physical one, rounded down and saturated to the signal."""
+    return saturate(signal, int64(np.floor(value / signal.scale)))
+
+
+@step
 def read_commands(params: Any, node: Any, rx: Any) -> None:
-    """command_n from the frames that pass their check; a missing or refused one keeps the last
-    value."""
-    if params.cars == 0 and received(node, rx, FORCE_CMD):
-        raw = get(int64(rx[FORCE_CMD.index].payload), FORCE_CMD.Force)
-        node.command_n[0] = raw * FORCE_CMD.Force.scale
-    if params.cars > 0 and received(node, rx, CAR_FORCE_1):
-        word = int64(rx[CAR_FORCE_1.index].payload)
-        node.command_n[0] = get(word, CAR_FORCE_1.Car1) * CAR_FORCE_1.Car1.scale
-        node.command_n[1] = get(word, CAR_FORCE_1.Car2) * CAR_FORCE_1.Car2.scale
-    if params.cars > 2 and received(node, rx, CAR_FORCE_2):
-        word = int64(rx[CAR_FORCE_2.index].payload)
-        node.command_n[2] = get(word, CAR_FORCE_2.Car3) * CAR_FORCE_2.Car3.scale
-        node.command_n[3] = get(word, CAR_FORCE_2.Car4) * CAR_FORCE_2.Car4.scale
-    if params.cars > 4 and received(node, rx, CAR_FORCE_3):
-        word = int64(rx[CAR_FORCE_3.index].payload)
-        node.command_n[4] = get(word, CAR_FORCE_3.Car5) * CAR_FORCE_3.Car5.scale
-        node.command_n[5] = get(word, CAR_FORCE_3.Car6) * CAR_FORCE_3.Car6.scale
-    if params.cars > 6 and received(node, rx, CAR_FORCE_4):
-        word = int64(rx[CAR_FORCE_4.index].payload)
-        node.command_n[6] = get(word, CAR_FORCE_4.Car7) * CAR_FORCE_4.Car7.scale
-        node.command_n[7] = get(word, CAR_FORCE_4.Car8) * CAR_FORCE_4.Car8.scale
+    """command_n and mode from the frames that pass their check; a missing or refused one keeps the
+    last value, and the command grows old."""
+    complete = received(node, rx, FORCE_CMD)
+    if complete:
+        word = int64(rx[FORCE_CMD.index].payload)
+        node.mode = get(word, FORCE_CMD.Mode)
+        if params.cars == 0:
+            node.command_n[0] = get(word, FORCE_CMD.Force) * FORCE_CMD.Force.scale
+    if params.cars > 0:
+        complete &= read_cars(node, rx, int64(0), CAR_FORCE_1, CAR_FORCE_1.Car1, CAR_FORCE_1.Car2)
+    if params.cars > 2:
+        complete &= read_cars(node, rx, int64(2), CAR_FORCE_2, CAR_FORCE_2.Car3, CAR_FORCE_2.Car4)
+    if params.cars > 4:
+        complete &= read_cars(node, rx, int64(4), CAR_FORCE_3, CAR_FORCE_3.Car5, CAR_FORCE_3.Car6)
+    if params.cars > 6:
+        complete &= read_cars(node, rx, int64(6), CAR_FORCE_4, CAR_FORCE_4.Car7, CAR_FORCE_4.Car8)
+    node.command_age = 0 if complete else node.command_age + 1
+
+
+@step
+def read_cars(node: Any, rx: Any, first: Any, message: Any, one: Any, other: Any) -> Any:
+    """The commands of two cars; 1 if their frame passes its check."""
+    passed = received(node, rx, message)
+    if passed:
+        word = int64(rx[message.index].payload)
+        node.command_n[first] = get(word, one) * one.scale
+        node.command_n[first + 1] = get(word, other) * other.scale
+    return passed
+
+
+@step
+def order_brakes(params: Any, state: Any) -> None:
+    """What ATP, the controller's mode and the age of the command ask of the safety brakes."""
+    node = state.node
+    stands = state.train.speed_m_s <= atp.STANDSTILL_M_S
+    requests = node.mode == EMERGENCY_REQUEST
+    if requests:
+        node.emergency_requested = 1
+    elif stands:
+        node.emergency_requested = 0
+    lost = node.command_age > params.node.command_age_max
+    holds = node.mode == HOLD and stands
+    service = state.atp.service != 0 or lost or holds
+    emergency = state.atp.emergency != 0 or node.emergency_requested != 0
+    brakes.order(
+        state.brakes,
+        atp.cuts_traction(params.atp, state.atp),
+        int64(1) if service else int64(0),
+        int64(1) if emergency else int64(0),
+    )
 
 
 @step
@@ -243,11 +291,46 @@ def fail(params: Any, node: Any, train: Any) -> None:
 
 
 @step
-def supervision(params: Any, tick: Any) -> Any:
-    """What ATP demands."""
+def demand(params: Any, state: Any, tick: Any) -> Any:
+    """What ATP demands, or the scenario's fault says that it does."""
     if tick >= params.brake_from and tick < params.brake_to:
-        return int64(params.brake_supervision)
-    return int64(0)
+        return max(int64(params.brake_supervision), int64(state.atp.demand))
+    return int64(state.atp.demand)
+
+
+@step
+def limit_word(params: Any, state: Any, tick: Any) -> Any:
+    """ATP_LIMIT."""
+    supervised = state.atp
+    distance = int64(NO_TARGET_M)
+    if supervised.target_distance_m < NO_TARGET_M:
+        distance = raw_below(ATP_LIMIT.TargetDistance, supervised.target_distance_m)
+    permitted = raw_of(ATP_LIMIT.PermittedSpeed, supervised.curve_m_s[atp.PERMITTED])
+    target = raw_of(ATP_LIMIT.TargetSpeed, supervised.target_speed_m_s)
+    return (
+        put(ATP_LIMIT.PermittedSpeed, permitted)
+        + put(ATP_LIMIT.TargetSpeed, target)
+        + put(ATP_LIMIT.TargetDistance, distance)
+        + put(ATP_LIMIT.Supervision, demand(params, state, tick))
+    )
+
+
+@step
+def or_none(speed_m_s: Any) -> Any:
+    """A speed of a curve, NaN if it does not limit."""
+    return speed_m_s if speed_m_s < np.inf else np.nan
+
+
+@step
+def show_supervision(params: Any, state: Any, truth: Any) -> None:
+    """ATP's part of a row of truth."""
+    curve = state.curve_m_s
+    truth.permitted_speed_m_s = curve[atp.PERMITTED]
+    truth.warning_speed_m_s = or_none(curve[atp.WARN])
+    truth.service_brake_speed_m_s = or_none(curve[atp.SBI])
+    truth.emergency_brake_speed_m_s = or_none(curve[atp.EBI])
+    truth.emergency_deceleration_speed_m_s = or_none(curve[atp.EBD])
+    truth.supervision = np.nan if params.supervision == atp.NONE else state.demand * 1.0
 
 
 @step
@@ -261,7 +344,7 @@ def build(model: Any) -> tuple[Any, Any, Any]:
     `sense(params, limits, state, chance, tick, tx)` and `actuate_and_advance(params, track, state,
     chance, tick, rx, truth)`.
 
-    Shapes: params, state [trains] of `params_dtype`/`state_dtype`; limits [n] of LIMIT; track [n]
+    Shapes: params, state [trains] of `params_dtype`/`state_dtype`; limits an atp.Limits; track [n]
     of track.SECTION; chance, truth [trains, ticks] of CHANCE, TRUTH; rx, tx [trains, MESSAGE_COUNT]
     of codec.MAILBOX.
     """
@@ -276,6 +359,8 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         radio.reset(state.radio)
         actuator.reset(state.actuator)
         actuator.preset(state.actuator, int64(0), params.node.holding_force_n)
+        atp.reset(state.atp)
+        brakes.reset(state.brakes)
         reset_train(params.train, state.train)
 
     @step
@@ -284,21 +369,10 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         train = state.train
         setting = params.node
         tick = int64(node.tick)
-        while int64(node.limit) + 1 < len(limits) and tick > limits[int64(node.limit)].until_tick:
-            node.limit += 1
-        node.permitted_speed_m_s = limits[int64(node.limit)].speed_m_s
+        atp.supervise(params.atp, limits, state.atp, tick, train.position_m, train.speed_m_s)
         if tick % CONTROL_PERIOD_TICKS == 0:
             e2e.send(node, tx, RUN_CTRL, control_word(node))
-        permitted = raw_of(ATP_LIMIT.PermittedSpeed, node.permitted_speed_m_s)
-        e2e.send(
-            node,
-            tx,
-            ATP_LIMIT,
-            put(ATP_LIMIT.PermittedSpeed, permitted)
-            + put(ATP_LIMIT.TargetSpeed, permitted)
-            + put(ATP_LIMIT.TargetDistance, int64(NO_TARGET_M))
-            + put(ATP_LIMIT.Supervision, supervision(setting, tick)),
-        )
+        e2e.send(node, tx, ATP_LIMIT, limit_word(setting, state, tick))
         rear = setting.rear_weight
         position = train.position_m + rear * (
             train.rear_position_m + setting.rear_offset_m - train.position_m
@@ -333,7 +407,7 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         truth.position_m = train.position_m
         truth.speed_m_s = train.speed_m_s
         truth.acceleration_m_s2 = train.acceleration_m_s2
-        truth.permitted_speed_m_s = node.permitted_speed_m_s
+        show_supervision(params.atp, state.atp, truth)
         truth.traction_j = train.traction_j
         truth.braking_j = train.braking_j
         truth.recuperated_j = params.node.recuperation * train.braking_j
@@ -342,6 +416,8 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         fail(params.node, node, train)
         command_train(params, state)
         actuator.shift(state.actuator)
+        order_brakes(params, state)
+        brakes.act(params.brakes, state.brakes, state.actuator, train.speed_m_s)
         advance_train(
             params.train,
             track,

@@ -22,10 +22,11 @@ import msgspec
 import numpy as np
 
 from plant_sim.actuator import Actuator
+from plant_sim.atp import Atp, braking_fault
 from plant_sim.line import Line
 from plant_sim.planner import PlanError, ProfilePlan, plan_profile
 from plant_sim.profile import Profile, displaced, evaluate, rate_of, stretched
-from plant_sim.track import Track
+from plant_sim.track import Track, sections
 from plant_sim.trains import couplers, lumped, point
 
 FOLDER = Path(__file__).with_name("scenarios")
@@ -132,6 +133,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     track: Track = Track()
     sensors: Sensors = Sensors()
     disturbance: Disturbance = Disturbance()
+    atp: Atp = Atp()
     run_length: RunLength | None = None  # none: every run lasts as long as the profile
     control: Control = Control()
     metrics: Metrics = Metrics()
@@ -418,5 +420,9 @@ def _check(path: str, scenario: Scenario) -> None:
         raise ScenarioError(f"{path}: key track.{key}: {model}")
     if scenario.line and not isinstance(scenario.train, point.Train):
         raise ScenarioError(f"{path}: key train.model: a line has trains of model 'point'")
-    if not scenario.profile.limits and scenario.profile.limit_above_m_s is None:
+    has_limits = scenario.profile.limits or scenario.profile.limit_above_m_s is not None
+    if not has_limits and not scenario.atp.speeds:
         raise ScenarioError(f"{path}: key profile.limits: expected at least one limit")
+    fault = braking_fault(scenario.atp, sections(scenario.track))
+    if fault:
+        raise ScenarioError(f"{path}: key {fault}")

@@ -13,11 +13,11 @@ import numpy as np
 
 from can_dbc.codec import MAILBOX, MESSAGE_COUNT, NEIGHBOUR_AHEAD_POSITION
 from can_dbc.step import INTERPRETED, step
-from plant_sim import actuator, plant, track
+from plant_sim import actuator, atp, brakes, plant, track
 from plant_sim.line import Fault
 from plant_sim.profile import RATE_ONE, rate_of, stretched_ticks
 from plant_sim.scenario import MODELS, Loaded, RunLength, Scenario, at_rate, members
-from plant_sim.trains import point
+from plant_sim.trains import couplers, point
 from plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 # Chance: what a random number is drawn for; each gets a stream of its own, in each train.
@@ -39,7 +39,7 @@ class World:
     actuate_and_advance: Any
     params: Any  # [trains]
     state: Any  # [trains]
-    limits: Any  # [n] of plant.LIMIT
+    limits: atp.Limits
     track: Any  # [n] of track.SECTION
     rx: Any  # [trains, MESSAGE_COUNT] mailboxes
     tx: Any
@@ -53,7 +53,7 @@ class World:
         that."""
         rate = timetable_rate(self.members[0], self.seed, run)
         if rate != int(self.state[0]["node"]["timetable_rate"]):
-            self.limits = rows(limits_of(at_rate(self.members[0], rate)))
+            self.limits = supervised(at_rate(self.members[0], rate))
         self.state["node"]["timetable_rate"] = rate
 
 
@@ -80,7 +80,7 @@ def build(loaded: Loaded, seed: int) -> World:
         actuate_and_advance=actuate_and_advance,
         params=rows(params),
         state=rows(np.zeros(len(trains), plant.state_dtype(model.STATE))),
-        limits=rows(limits_of(loaded)),
+        limits=supervised(loaded),
         track=rows(track.sections(scenario.track)),
         rx=rows(np.zeros(boxes, MAILBOX)),
         tx=rows(np.zeros(boxes, MAILBOX)),
@@ -108,6 +108,15 @@ def _params(loaded: Loaded, model: Any) -> np.ndarray:
     node["rear_weight"] = 0.5 if scenario.sensors.location == "mean" else 0.0
     node["rear_offset_m"] = train.rear_offset_m
     node["recuperation"] = scenario.actuator.recuperation_efficiency
+    node["command_age_max"] = scenario.atp.command_age_max_ticks
+    params["atp"] = atp.calibrate(scenario.atp)
+    params["brakes"] = brakes.calibrate(
+        scenario.atp.service_brake,
+        scenario.atp.emergency_brake,
+        scenario.atp.traction_cut_off_s,
+        train.masses_kg if isinstance(train, couplers.Train) else [train.mass_kg],
+        scenario.period_s,
+    )
     if isinstance(train, point.Train) and train.held_at_start:
         sections = rows(track.sections(scenario.track))
         here = track.section_at(sections, train.start_m, 0)
@@ -134,21 +143,37 @@ def _fail(node: np.ndarray, fault: Fault, scenario: Scenario) -> None:
         node["weak_force_n"] = fault.traction_share * largest_n
     else:
         node["brake_m_s2"] = fault.brake_m_s2
-        node["brake_supervision"] = plant.EMERGENCY_BRAKE if fault.emergency else 0
+        node["brake_supervision"] = atp.EMERGENCY_BRAKE if fault.emergency else 0
+
+
+def supervised(loaded: Loaded) -> atp.Limits:
+    """What ATP supervises, for the steps."""
+    scenario = loaded.scenario
+    sections = track.sections(scenario.track)
+    steepest = min(atp.gradients(sections, 0.0).values)
+    rolling_m_s2 = max(-steepest, 0.0) + scenario.disturbance.amplitude_m_s2
+    pulling_m_s2 = scenario.actuator.force_max_m_s2 + rolling_m_s2
+    limits = limits_of(loaded)
+    made = atp.supervised(
+        scenario.atp, limits, sections, scenario.period_s, pulling_m_s2, rolling_m_s2
+    )
+    return atp.Limits(*map(rows, made))
 
 
 def limits_of(loaded: Loaded) -> np.ndarray:
-    """The permitted speed over time, [n] of plant.LIMIT: as the plan states it, or a row for each
-    speed of the reference."""
+    """The limit over time, [n] of atp.LIMIT: as the plan states it, a row for each speed of the
+    reference, or none."""
     plan, period_s = loaded.scenario.profile, loaded.scenario.period_s
     if plan.limit_above_m_s is not None:
         speed_m_s = loaded.profile.speed_m_s
         last = np.flatnonzero(np.diff(speed_m_s, append=np.inf))
-        limits = np.zeros(len(last), plant.LIMIT)
+        limits = np.zeros(len(last), atp.LIMIT)
         limits["until_tick"] = last
         limits["speed_m_s"] = speed_m_s[last] + plan.limit_above_m_s
         return limits
-    limits = np.zeros(len(plan.limits), plant.LIMIT)
+    if not plan.limits:
+        return np.array([(NEVER, np.inf)], atp.LIMIT)
+    limits = np.zeros(len(plan.limits), atp.LIMIT)
     pace = 1 + loaded.timetable_rate / RATE_ONE
     for row, limit in zip(limits, plan.limits, strict=True):
         row["until_tick"] = round(limit.until_s / period_s / pace)

@@ -60,7 +60,7 @@ def _worst(key: str, values: list[Any]) -> Any:
     known = [value for value in values if value is not None]
     if not known:
         return None
-    if key.startswith("min_") or key == "overspeed_margin_m_s":
+    if key.startswith(("min_", "first_")) or key == "overspeed_margin_m_s":
         return min(known)
     if key == "energy_kwh_per_t":
         return sum(known) / len(known)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from plant_sim.atp import EMERGENCY_BRAKE, SERVICE_BRAKE
 from plant_sim.scenario import Loaded
 
 
@@ -38,7 +39,7 @@ def run_metrics(
         for name in ("traction", "braking", "recuperated")
     }
     jerk = np.diff(command_n) / (mass * scenario.period_s)
-    return {
+    row = {
         "ticks": ticks,
         "max_delta_m_s": None if alpha is None else _peak(alpha * e + ed),
         "max_speed_error_m_s": _peak(ed),
@@ -55,6 +56,30 @@ def run_metrics(
         "recuperated_kwh_per_t": work["recuperated"],
         "net_energy_kwh_per_t": work["traction"] - work["recuperated"],
     }
+    if scenario.atp.supervision != "none":
+        row |= supervision(truth)
+    return row
+
+
+def supervision(truth: np.ndarray) -> dict[str, Any]:
+    """What ATP did in a run, and the largest speed above each of its curves, 0 for none."""
+    begins = _rises(truth["supervision"] >= SERVICE_BRAKE)
+    over = {
+        f"over_{curve}_m_s": max(float(np.nanmax(truth["speed_m_s"] - limit)), 0.0)
+        for curve in ("permitted", "warning", "service_brake", "emergency_brake")
+        if not np.isnan(limit := truth[f"{curve}_speed_m_s"]).all()
+    }
+    return {
+        "atp_interventions": len(begins),
+        "atp_emergency_brakes": len(_rises(truth["supervision"] == EMERGENCY_BRAKE)),
+        "first_intervention_tick": int(begins[0]) if len(begins) else None,
+        **over,
+    }
+
+
+def _rises(flags: np.ndarray) -> np.ndarray:
+    """The ticks at which a flag comes on."""
+    return np.flatnonzero(np.diff(flags, prepend=False) & flags)
 
 
 def _peak(values: np.ndarray) -> float:

@@ -48,7 +48,7 @@ from can_dbc.codec import (
     get,
 )
 from can_dbc.hub_server import ERROR, EXTENDED
-from plant_sim.plant import TICK_MASK, TRUTH
+from plant_sim.plant import ATP_COLUMNS, TICK_MASK, TRUTH
 from tools.frames import held
 
 PLANT, CONTROLLER = "plant", "controller"
@@ -242,6 +242,8 @@ def measured_truth(frames: np.ndarray, ticks: int, period_s: float) -> np.ndarra
     """What the bus shows of a foreign plant, [ticks] of plant.TRUTH, from the FRAME rows of a run:
     measured instead of true state, the force and the energy that were commanded."""
     truth = np.zeros(ticks, TRUTH)
+    for name in ATP_COLUMNS:  # what a foreign ATP would do is not on the bus
+        truth[name] = np.nan
     truth["position_m"] = held(frames, ticks, TRAIN_POSITION, "Position")
     truth["speed_m_s"] = held(frames, ticks, TRAIN_SPEED, "Speed")
     truth["acceleration_m_s2"] = held(frames, ticks, TRAIN_SPEED, "Acceleration")

@@ -215,6 +215,14 @@ BARS = (
     "rms_speed_error_m_s",
 )
 
+# Curves of ATP beside the true speed: fields of the truth, their names and colours.
+CURVES: dict[str, tuple[str, Colour]] = {
+    "warning_speed_m_s": ("warning", YELLOW),
+    "service_brake_speed_m_s": ("service brake", ORANGE),
+    "emergency_brake_speed_m_s": ("emergency brake", RED),
+    "emergency_deceleration_speed_m_s": ("emergency deceleration", GREY),
+}
+
 # True errors: what is compared with the reference column of the same name.
 ERRORS = {"position_error_m": "position_m", "speed_error_m_s": "speed_m_s"}
 
@@ -378,6 +386,9 @@ class TraceWriter:
                 continue
             entity = self._entity(f"truth/{field}", run, train)
             style = (["true"], [GREEN]) if single else ([label], [colour])
+            if field in CURVES:
+                name, colour_of_curve = CURVES[field]
+                style = ([name], [colour_of_curve])
             self._log_scalars(entity, index, table[field][:, None], *style)
         for error, field in ERRORS.items():
             if field not in (table.dtype.names or ()):
@@ -649,6 +660,7 @@ def _blueprint(
                 "Speed: measured blue, reference orange, permitted red, target pink [m/s]",
                 f"bus/speed/{current}",
                 "reference/speed_m_s",
+                *(f"truth/{curve}/{current}" for curve in CURVES),
                 legend=False,
             ),
             plot("Force by car [N]", f"bus/car_force/{current}")

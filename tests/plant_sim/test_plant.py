@@ -25,7 +25,7 @@ from can_dbc.codec import (
     get,
     put,
 )
-from plant_sim import plant, world
+from plant_sim import atp, plant, world
 from plant_sim.scenario import load
 
 PAPER, DEFAULT = "subway-paper", "subway"
@@ -250,6 +250,100 @@ def test_cars_are_obeyed_one_by_one_and_the_total_is_not():
     assert given_out == pytest.approx([10.0, 10.0, 12.0, -24.0, 50.0, 30.0, 0.0, 0.0])
 
 
+def full(rig, ticks, **signals):
+    """Forces of ticks in which all of the command arrives."""
+    shown = []
+    for _ in range(ticks):
+        rig.receive(FORCE_CMD, **{"Force": 1e5, "Mode": 1} | signals)
+        rig.sense()
+        shown.append(float(rig.advance()["force_n"]))
+    return shown
+
+
+def test_the_vehicle_brakes_when_commands_stay_away():
+    rig = Rig()
+    assert set(full(rig, 300)) == {1e5}
+    lost = [float(rig.advance()["force_n"]) for _ in range(250)]
+    age_max, cut_off = 30, 50
+    assert set(lost[: age_max + cut_off]) == {1e5}
+    assert max(lost[age_max + cut_off :]) < 0
+    assert lost[-1] == pytest.approx(-0.8 * 194295.0)
+    assert set(full(rig, 3)) == {1e5}  # a command comes again
+
+
+def test_a_car_without_commands_is_as_bad_as_none():
+    rig = Rig(DEFAULT)
+    for tick in range(200):
+        rig.receive(FORCE_CMD, Force=0.0)
+        rig.receive(CAR_FORCE_1, Car1=0.0, Car2=0.0)
+        rig.receive(CAR_FORCE_3, Car5=0.0, Car6=0.0)
+        if tick < 10:
+            rig.receive(CAR_FORCE_2, Car3=0.0, Car4=0.0)
+        row = rig.advance()
+        if tick == 40:
+            assert row["force_n"] == 0
+    assert row["force_n"] == pytest.approx(-0.8 * 194295.0, rel=1e-6)
+
+
+def test_the_controller_can_ask_for_the_emergency_brake_until_standstill():
+    rig = Rig()
+    rig.train["speed_m_s"] = 2.0
+    full(rig, 1, Mode=4, Force=0.0)
+    forces = full(rig, 150)
+    assert forces[-1] == pytest.approx(-1.2 * 194295.0)
+    while rig.train["speed_m_s"] > atp.STANDSTILL_M_S:
+        assert full(rig, 1)[0] < 0
+    assert full(rig, 2)[-1] == 1e5
+
+
+def test_hold_brakes_at_standstill_only():
+    rig = Rig()
+    rig.train["speed_m_s"] = 1.0
+    assert set(full(rig, 20, Mode=3, Force=0.0)) == {0.0}
+    rig.train["speed_m_s"] = 0.0
+    assert full(rig, 120, Mode=3, Force=0.0)[-1] == pytest.approx(-0.8 * 194295.0)
+    assert rig.train["speed_m_s"] == 0
+    assert full(rig, 1)[-1] == 1e5
+
+
+# ATP.
+
+
+def test_atp_is_told_on_the_bus_and_brakes_whatever_is_commanded():
+    rig = Rig("subway-atp:short")
+    stops_m = 2800.0
+    rig.train["car_position_m"] = 2500.0 - 19.5 * np.arange(8)
+    rig.train["car_speed_m_s"] = 20.0
+    rig.train["position_m"], rig.train["speed_m_s"] = 2500.0, 20.0
+    told, rows = [], []
+    for _ in range(3000):
+        rig.receive(FORCE_CMD, Force=2e5)
+        for message, one in ((CAR_FORCE_1, 1), (CAR_FORCE_2, 3), (CAR_FORCE_3, 5)):
+            rig.receive(message, **{f"Car{one}": 4e4, f"Car{one + 1}": 4e4})
+        rig.sense()
+        told.append(
+            [
+                rig.sent(ATP_LIMIT, name)
+                for name in ("Supervision", "PermittedSpeed", "TargetSpeed", "TargetDistance")
+            ]
+        )
+        rows.append(rig.advance())
+    demand, permitted, speed, distance = np.transpose(told)
+    truth = np.array(rows)
+    assert (demand == truth["supervision"]).all()
+    assert {atp.NORMAL, atp.SERVICE_BRAKE} < set(demand)
+    np.testing.assert_allclose(permitted, truth["permitted_speed_m_s"], atol=0.0051)
+    assert not speed.any()
+    assert (distance == np.floor(np.maximum(stops_m - truth["position_m"], 0))).all()
+    assert abs(truth["speed_m_s"][-1]) < 1e-3
+    assert stops_m - 100 < truth["position_m"][-1] < stops_m + 20
+
+
+def test_without_supervision_truth_has_no_curves():
+    row = Rig().advance()
+    assert all(np.isnan(row[name]) for name in plant.ATP_COLUMNS)
+
+
 def test_a_new_run_forgets_the_last_command():
     rig = Rig()
     rig.receive(FORCE_CMD, Force=1e5)
@@ -320,12 +414,17 @@ import numpy as np
 from plant_sim import plant, world
 from plant_sim.scenario import load
 
-for name in ("subway-paper", "subway"):
+for name in ("subway-paper", "subway", "subway-atp:short"):
     loaded = load(name)
     here = world.build(loaded, 3)
     chance = world.chances(here, 1)
     truth = world.rows(np.zeros((1, 40), plant.TRUTH))
     here.begin(here.params, here.state)
+    if name == "subway-atp:short":  # where its curves are
+        here.state["train"]["position_m"] = 2600.0
+        here.state["train"]["speed_m_s"] = 20.0
+        here.state["train"]["car_position_m"] = 2600.0 - 19.5 * np.arange(8)
+        here.state["train"]["car_speed_m_s"] = 20.0
     for tick in range(40):
         here.state["node"]["command_n"][0, :6] = (2e4 if tick < 25 else -6e4) + 100.0 * tick
         here.sense(here.params, here.limits, here.state, chance, tick, here.tx)
@@ -342,5 +441,5 @@ def test_interpreted_and_compiled_steps_give_the_same_bits():
         environment = {**os.environ, "ATO_HIL_INTERPRETED": interpreted}
         command = [sys.executable, "-c", DRIVE]
         outputs.append(subprocess.check_output(command, env=environment, text=True))
-    assert outputs[0].count("\n") == 80
+    assert outputs[0].count("\n") == 120
     assert outputs[0] == outputs[1]

@@ -169,7 +169,7 @@ def test_params_are_those_of_the_scenario():
     assert actuators["delay"] == 1
     assert actuators["slope"] == pytest.approx(194295.0 * 1.0 * 0.01)
     assert actuators["traction_gain"] == pytest.approx(0.001 / 0.2)
-    assert here.limits["until_tick"].tolist() == [2500, 10000, 11000, 16000, 19000]
+    assert here.limits.times["until_tick"].tolist() == [2500, 10000, 11000, 16000, 19000]
     assert len(here.track) == 16
 
 
