@@ -181,6 +181,16 @@ def limits_of(loaded: Loaded) -> np.ndarray:
     return limits
 
 
+def ceiling_of(loaded: Loaded) -> np.ndarray:
+    """The static limit at each tick of the reference, [ticks], m/s: by time and by position."""
+    times = limits_of(loaded)
+    row = np.searchsorted(times["until_tick"], np.arange(loaded.ticks))
+    by_time = times["speed_m_s"][np.minimum(row, len(times) - 1)]
+    way = atp.static_speeds(loaded.scenario.atp)
+    place = np.searchsorted(way.from_m, loaded.profile.position_m, side="right") - 1
+    return np.minimum(by_time, np.array(way.values)[place])
+
+
 def run_ticks(loaded: Loaded, seed: int, run: int) -> int:
     """Control periods of a run: all of its timetable, or as far as its random length goes."""
     lengths = loaded.scenario.run_length

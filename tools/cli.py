@@ -430,23 +430,19 @@ def profile(
 ) -> None:
     """Print the reference profile and the limit of each control period as CSV, for nodes of your
     own."""
-    import numpy as np
-
     from plant_sim.scenario import at_rate, load
-    from plant_sim.world import limits_of, timetable_rate
+    from plant_sim.world import ceiling_of, timetable_rate
 
     with one_line_for_bad_input():
         loaded = load(scenario)
     if run:
         loaded = at_rate(loaded, timetable_rate(loaded, seed, run))
-    reference, limits = loaded.profile, limits_of(loaded)
-    row_of_tick = np.searchsorted(limits["until_tick"], np.arange(loaded.ticks))
-    limit_m_s = limits["speed_m_s"][np.minimum(row_of_tick, len(limits) - 1)]
+    reference = loaded.profile
     columns = {
         "position_m": reference.position_m,
         "speed_m_s": reference.speed_m_s,
         "acceleration_m_s2": reference.acceleration_m_s2,
-        "permitted_speed_m_s": limit_m_s,
+        "permitted_speed_m_s": ceiling_of(loaded),
     }
     lines = [",".join(["tick", *columns])]
     for tick, row in enumerate(zip(*columns.values(), strict=True)):

@@ -158,6 +158,20 @@ def test_a_limit_can_follow_the_reference(variant):
     assert len(limits) < loaded.ticks  # a cruise takes one row
 
 
+def test_the_ceiling_is_the_lower_of_time_and_position(variant):
+    loaded = variant(
+        "[atp]\nspeeds = [{ until_m = 1000.0, speed_m_s = 21.0 },"
+        " { until_m = 4e3, speed_m_s = 30.0 }]\n"
+    )
+    ceiling = world.ceiling_of(loaded)
+    limits = world.ceiling_of(variant("", "plain"))
+    slow = loaded.profile.position_m < 1000.0
+    assert set(limits) == {19.6, 22.6}
+    assert (ceiling[slow] == np.minimum(limits[slow], 21.0)).all()
+    assert (ceiling[~slow] == limits[~slow]).all()
+    assert 21.0 in ceiling
+
+
 def test_params_are_those_of_the_scenario():
     here = world.build(load("subway"), 1)
     node, actuators = here.params["node"][0], here.params["actuator"][0]
