@@ -134,11 +134,11 @@ def test_a_run_s_limits_go_with_its_timetable(variant):
         run = at_rate(loaded, rate)
         planned = world.limits_of(loaded)
         if text:
-            at = np.searchsorted(here.limits["until_tick"], np.arange(run.ticks))
-            assert (here.limits["speed_m_s"][at] == run.profile.speed_m_s + 0.5).all()
-            assert here.limits["speed_m_s"].max() != planned["speed_m_s"].max()
+            at = np.searchsorted(here.limits.times["until_tick"], np.arange(run.ticks))
+            assert (here.limits.times["speed_m_s"][at] == run.profile.speed_m_s + 0.5).all()
+            assert here.limits.times["speed_m_s"].max() != planned["speed_m_s"].max()
         else:
-            factor = here.limits["until_tick"] / planned["until_tick"]
+            factor = here.limits.times["until_tick"] / planned["until_tick"]
             assert factor == pytest.approx((run.ticks - 1) / 19_000, abs=2e-4)
 
 
