@@ -66,6 +66,7 @@ class Window(
     msgspec.Struct,
     frozen=True,
     forbid_unknown_fields=True,
+    omit_defaults=True,
     kw_only=True,
     rename={"from_s": "from", "to_s": "to"},
 ):

@@ -19,6 +19,8 @@ from rich.table import Table
 if TYPE_CHECKING:
     from plant_sim.scenario import Loaded
     from tools.bus_report import Report as BusReport
+    from tools.residual import Rate
+    from tools.threats import Campaign
     from tools.verify import Row
 
 app = typer.Typer(
@@ -35,6 +37,7 @@ PACKAGES = ("can_dbc", "controller", "plant_sim", "tools")
 EXIT_BAD_INPUT = 1
 EXIT_ENDED_EARLY = 3
 EXIT_INTERRUPTED = 130
+RESIDUAL_FRAMES = 10_000_000  # random corruptions, for the rate of those that are not seen
 
 
 class Mode(StrEnum):
@@ -786,6 +789,82 @@ def _print_rows(rows: list[Row]) -> None:
         cells = (escape(cell) for cell in (row.name, row.subject, row.how, row.result))
         shown.add_row(*cells, f"[{colour}]{row.state}[/]")
     console.print(shown)
+
+
+@app.command()
+def threats(
+    frames: Annotated[
+        int | None,
+        typer.Option(min=1, help="At least so many; a million in SIL, a hundred thousand in HIL."),
+    ] = None,
+    mode: Annotated[Mode, typer.Option(help="sil, or hil: over a bus as well.")] = Mode.sil,
+    bus: Annotated[str, typer.Option(help="Of mode hil, as for `run`.")] = "auto",
+    seed: Annotated[int, typer.Option(min=0, help="Of the faults.")] = 1,
+    out: Annotated[
+        Path, typer.Option(help="Folder of threats.json, its scenario and its faults.")
+    ] = Path("runs/threats"),
+) -> None:
+    """Attack a run with every threat of EN 50159, and say what was noticed, how soon, and what
+    came of it."""
+    from tools import residual
+    from tools import threats as campaign
+    from tools.hil import RunError
+
+    if mode is Mode.mil:
+        raise _fail("threats: mode is mil, expected sil or hil", EXIT_BAD_INPUT)
+    least = frames or (1_000_000 if mode is Mode.sil else 100_000)
+    try:
+        with one_line_for_bad_input(), console.status("compiling ...") as status:
+            rates = residual.measure(RESIDUAL_FRAMES, seed)
+            found = campaign.run(least, mode.value, bus, seed, out, status.update)
+    except RunError as error:
+        raise _fail(str(error), EXIT_ENDED_EARLY) from None
+    except KeyboardInterrupt:
+        raise _fail("interrupted", EXIT_INTERRUPTED) from None
+    _print_threats(found)
+    _print_residual(rates)
+    problems = found.problems + [f"{r.corruption}: not as computed" for r in rates if not r.agrees]
+    if problems:
+        raise _fail("; ".join(problems), EXIT_BAD_INPUT)
+
+
+def _print_threats(found: Campaign) -> None:
+    headings = ("injected", "noticed", "not, no\neffect", "not, force\nchanged")
+    reaction = ("reaction\np50", "ticks\nmax", "bound", "over the\nlimit m/s")
+    table = Table("threat", "runs", "frames", *headings, *reaction, header_style="bold")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for row in found.rows:
+        table.add_row(
+            row.threat,
+            *(f"{n:,}" for n in (row.runs, row.frames, row.injected, row.noticed)),
+            *(f"{n:,}" for n in (row.harmless, row.with_effect)),
+            *("-" if n is None else f"{n:g}" for n in (row.reaction_p50, row.reaction_max)),
+            "none" if row.bound is None else f"{row.bound}",
+            f"{row.overspeed_m_s:.2f}",
+            style="red" if row.problems else None,
+        )
+    console.print(table)
+    text = f"{found.frames:,} frames, {found.mode}, seed {found.seed}, digest {found.digest}"
+    console.print(text, soft_wrap=True)
+
+
+def _print_residual(rates: list[Rate]) -> None:
+    table = Table("corruption", "frames", "taken for good", "share", header_style="bold")
+    table.add_column("computed")
+    table.add_column("99.99 % interval")
+    for rate in rates:
+        exact = rate.low == rate.high
+        table.add_row(
+            rate.corruption,
+            f"{rate.frames:,}",
+            f"{rate.passed:,}",
+            f"{rate.passed / rate.frames:.3g}",
+            "all tried" if exact else f"{rate.computed:.4g}",
+            "-" if exact else f"{rate.low:.4g} .. {rate.high:.4g}",
+            style=None if rate.agrees else "red",
+        )
+    console.print(table)
 
 
 @app.command()

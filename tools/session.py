@@ -163,9 +163,13 @@ def _save_injected(session: Session, events: Sequence[faults.Event]) -> None:
     """The log of injected faults as a table, and how many of each kind in the summary."""
     kinds = Counter(event.kind for event in events)
     session.summary["faults_injected"] = dict(sorted(kinds.items()))
+    write_text(session.options.out / "faults.csv", log_of(events))
+
+
+def log_of(events: Sequence[faults.Event]) -> str:
+    """The log of injected faults as CSV."""
     rows = [faults.Event.__struct_fields__, *(msgspec.structs.astuple(event) for event in events)]
-    lines = [",".join(str(cell) for cell in row) for row in rows]
-    write_text(session.options.out / "faults.csv", "\n".join(lines) + "\n")
+    return "".join(",".join(str(cell) for cell in row) + "\n" for row in rows)
 
 
 def _refuse_what_is_for_one_train(options: Options) -> None:

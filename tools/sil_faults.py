@@ -38,6 +38,8 @@ class Side:
     controller: controller_node.Controller
     to_controller: Inbox
     to_plant: Inbox
+    plant_mailboxes: np.ndarray
+    plant_counters: np.ndarray  # end-to-end counters of the last frames received
 
 
 class Watch(Protocol):
@@ -89,6 +91,8 @@ def run_line(
                 here.state["node"]["received"][train],
                 Receiver(plan, PLANT, train, events.append),
             ),
+            here.rx[train],
+            here.state["node"]["received"][train],
         )
         for train, node in enumerate(nodes)
     ]
