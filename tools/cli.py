@@ -828,6 +828,52 @@ def threats(
         raise _fail("; ".join(problems), EXIT_BAD_INPUT)
 
 
+@app.command()
+def noise(
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario or a .toml file; of one train.")
+    ] = "subway",
+    frames: Annotated[int, typer.Option(min=1, help="Random frames to send.")] = 1_000_000,
+    words: Annotated[
+        int, typer.Option(min=1, help="Random words into mailboxes, without a bus.")
+    ] = 10_000_000,
+    bus: Annotated[str, typer.Option(help="As for `run`.")] = "auto",
+    seed: Annotated[int, typer.Option(min=0, help="Of noise and scenario.")] = 1,
+) -> None:
+    """Send random frames beside a run (HIL), and say whether a force changed; then put random words
+    into the mailboxes of firmware and plant."""
+    from tools import fuzz
+    from tools import noise as flood
+    from tools.hil import RunError
+
+    try:
+        with one_line_for_bad_input(), console.status("compiling ...") as status:
+            found = flood.beside(scenario, frames, seed, bus, status.update)
+            status.update("random words ...")
+            direct = fuzz.run(scenario, words, seed)
+    except RunError as error:
+        raise _fail(str(error), EXIT_ENDED_EARLY) from None
+    except KeyboardInterrupt:
+        raise _fail("interrupted", EXIT_INTERRUPTED) from None
+    kinds = ", ".join(f"{count:,} {kind}" for kind, count in found.kinds.items())
+    console.print(f"random frames sent   {found.frames:,} ({kinds})", soft_wrap=True)
+    console.print(f"beside               {found.runs} runs, {found.ticks:,} ticks")
+    console.print(f"ticks changed        {found.changed}")
+    console.print(f"expected to be taken {found.expected_taken:.2g} frames")
+    console.print(f"random words         {direct.words:,}, half of them protected")
+    console.print(f"largest force        {direct.largest_command:.3f} commanded,", end=" ")
+    console.print(f"{direct.largest_force:.3f} applied, of what the train can give")
+    problems = []
+    if found.frames < frames:
+        problems.append(f"{found.frames} random frames were sent, expected {frames}")
+    if found.changed:
+        problems.append(f"{found.changed} ticks are not as without noise")
+    if max(direct.largest_command, direct.largest_force) > 1:
+        problems.append("a force is larger than the train can give")
+    if problems:
+        raise _fail("; ".join(problems), EXIT_BAD_INPUT)
+
+
 def _print_threats(found: Campaign) -> None:
     headings = ("injected", "noticed", "not, no\neffect", "not, force\nchanged")
     reaction = ("reaction\np50", "ticks\nmax", "bound", "over the\nlimit m/s")

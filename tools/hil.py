@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Collection, Generator
+from collections.abc import Collection, Generator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -183,13 +183,15 @@ def run(
     external: Collection[str] = (),
     cars: int = 0,
     faults: Path | None = None,
+    others: Mapping[str, list[str]] | None = None,
 ) -> Generator[tuple[Node, dict[str, Any], Bench], None, None]:
     """Events of the nodes, `ready` of each first, until all runs are done and recorded; see the
     `tell` calls of the processes.
 
     `buses` has an entry for each train, and so has `controllers`, or none where the controller is
     one of the `external` nodes; `cars` are those that the plant takes a force for, each by itself;
-    `faults` is the folder of can_dbc.faults.receiver.
+    `faults` is the folder of can_dbc.faults.receiver; `others` are further nodes by name, modules
+    with their arguments.
 
     Raises RunError with one line if a node dies, falls silent or reports an error.
     """
@@ -218,6 +220,8 @@ def run(
             bench.start(name, ["controller.process", "--bus", buses[train], *arguments])
             if train == 0:
                 bench.wait_ready()  # what the first controller compiles, the others load
+        for name, arguments in (others or {}).items():
+            bench.start(name, arguments)
         bench.wait_ready()
         for node in bench.nodes.values():
             yield node, node.said["ready"], bench

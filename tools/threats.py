@@ -52,6 +52,8 @@ from can_dbc.faults import (
     Silence,
     Stuck,
 )
+from controller.guard import reaction_ticks
+from controller.interface import FAULT_CONTROL_LOST, FAULT_SPEED_LOST
 from plant_sim.scenario import Loaded, load
 from tools import session, setup
 from tools.evidence import READ, Evidence
@@ -199,7 +201,7 @@ def threats() -> list[Threat]:
             id=target,
             source=NAMES[(i + 1) % len(NAMES)],
             messages=(TRAIN_POSITION.name if NODE_OF[target] == CONTROLLER else FORCE_CMD.name,),
-            probability=PROBABILITY,
+            probability=PROBABILITY / (10 if target == RUN_CTRL.name else 1),  # it is sent seldom
             from_tick=FIRST_TICK,
         )
         for i, target in enumerate(NAMES)
@@ -282,7 +284,7 @@ def in_process(
 ) -> tuple[Campaign, list[Event]]:
     """All runs in one process: the campaign with a row for each threat, and all injected faults."""
     nodes = setup.controllers_for([loaded], loaded.scenario.law)
-    guard = nodes[0].params[0]["guard"]
+    bounds = reaction_ticks(nodes[0].params[0]["guard"])
     evidence = Evidence(loaded.scenario.period_s)
     digest = LineDigest(1)
     by_run = {run: each for each in listed for run in each.runs}
@@ -307,7 +309,7 @@ def in_process(
         if each.threat.stays:
             _judge_reaction(row, each.threat, result, evidence, reactions[row.threat])
             slow = RUN_CTRL.name in row.threat
-            row.bound = int(guard["control_age_max" if slow else "age_max"]) + 1
+            row.bound = bounds[FAULT_CONTROL_LOST if slow else FAULT_SPEED_LOST]
         else:
             row.bound = NOTICE_TICKS
             reactions[row.threat] += noticed

@@ -1,0 +1,200 @@
+"""Random frames on the bus beside a run: any identifier, length and payload, remote, extended, FD
+and error frames. They may crash nothing and change no force.
+
+The noise is a node of its own (`python -m tools.noise`). It sends a burst after each
+TRAIN_POSITION: as much as nodes that answer every tick can read, on any bus. The run is then
+compared with the same run without noise: the true motion and force of the train, tick by tick, bit
+by bit.
+
+A random frame is taken for good if it is a standard data frame of 8 bytes with the identifier of a
+message that a node reads, and its CRC, Data-ID nibble and counter are right. `expected_taken` says
+how often that is to be expected; of ten million frames, less than once in ten.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from math import ceil
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import can
+import msgspec
+import numpy as np
+
+from can_dbc.bus import BusError, choose_bus, open_bus, recv_frames
+from can_dbc.child import Stop, follow_parent, tell
+from can_dbc.codec import TRAIN_POSITION
+from plant_sim.scenario import load
+from tools import hil, setup, sil
+from tools.evidence import READ
+from tools.observer import PLANT
+
+BURST = 400  # frames in a tick
+RECEIVE_TIMEOUT_S = 0.1
+SEND_TIMEOUT_S = 1.0
+FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+# Share of each kind of frame, in 256ths, one after the other; the rest are data frames.
+ERROR_FRAMES, REMOTE_FRAMES, FD_FRAMES = 8, 24, 48
+SHARE_OF_MAILBOX_FRAMES = (256 - ERROR_FRAMES - REMOTE_FRAMES - FD_FRAMES) / 256 / 2 / 9
+TAKEN = 2.0**-8 * 2.0**-4 * (5 / 16)  # CRC, nibble, a counter that is not too far ahead
+
+
+class Outcome(msgspec.Struct):
+    """A run with noise beside the run without."""
+
+    frames: int  # sent by the noise
+    kinds: dict[str, int]
+    runs: int
+    ticks: int
+    changed: int  # ticks in which force or motion of the train is another
+    expected_taken: float  # random frames that a node takes for good
+
+
+def burst(random: np.random.Generator, count: int, fd: bool) -> list[can.Message]:
+    """Random frames; those of CAN FD only where the bus takes them."""
+    kinds = random.integers(0, 256, count)
+    extended = random.integers(0, 2, count).astype(bool)
+    identifiers = random.integers(0, 1 << 29, count)
+    lengths = random.integers(0, 9, count)
+    fd_lengths = random.integers(0, len(FD_LENGTHS), count)
+    payloads = random.bytes(64 * count)
+    messages = []
+    for i in range(count):
+        kind, long = int(kinds[i]), bool(extended[i])
+        is_error = kind < ERROR_FRAMES
+        is_remote = not is_error and kind < ERROR_FRAMES + REMOTE_FRAMES
+        is_fd = fd and not is_error and not is_remote and kind >= 256 - FD_FRAMES
+        length = FD_LENGTHS[fd_lengths[i]] if is_fd else int(lengths[i])
+        messages.append(
+            can.Message(
+                arbitration_id=int(identifiers[i]) if long else int(identifiers[i]) & 0x7FF,
+                is_extended_id=long,
+                is_error_frame=is_error,
+                is_remote_frame=is_remote,
+                is_fd=is_fd,
+                dlc=length,
+                data=None if is_remote else payloads[64 * i : 64 * i + length],
+            )
+        )
+    return messages
+
+
+def kind_of(message: can.Message) -> str:
+    """What the table calls a frame."""
+    if message.is_error_frame:
+        return "error"
+    if message.is_remote_frame:
+        return "remote"
+    if message.is_fd:
+        return "fd"
+    return "extended" if message.is_extended_id else "standard"
+
+
+def flood(bus: can.BusABC, frames: int, seed: int, fd: bool, stop: Stop) -> dict[str, int]:
+    """Sends `frames` random frames, a burst after each TRAIN_POSITION; how many of each kind.
+
+    Raises can.CanError if the bus is gone.
+    """
+    random = np.random.default_rng(seed)
+    kinds: dict[str, int] = {}
+    sent = 0
+    while sent < frames and not stop.requested:
+        heard = recv_frames(bus, RECEIVE_TIMEOUT_S)
+        if not any(frame_id == TRAIN_POSITION.frame_id for frame_id, _ in heard):
+            continue
+        for message in burst(random, min(BURST, frames - sent), fd):
+            bus.send(message, SEND_TIMEOUT_S)
+            kind = kind_of(message)
+            kinds[kind] = kinds.get(kind, 0) + 1
+            sent += 1
+    return kinds
+
+
+def main() -> int:
+    """Exit status 0 when all is sent or after SIGTERM, 1 for bad input, 2 if the bus is gone."""
+    parser = argparse.ArgumentParser(prog="python -m tools.noise", description=__doc__)
+    parser.add_argument("--bus", required=True)
+    parser.add_argument("--frames", type=int, required=True)
+    parser.add_argument("--seed", type=int, required=True)
+    arguments = parser.parse_args()
+    stop = Stop()
+    follow_parent()
+    try:
+        bus, fd = open_for_noise(arguments.bus)
+    except BusError as error:
+        tell("error", message=str(error))
+        return 1
+    tell("ready")
+    try:
+        kinds = flood(bus, arguments.frames, arguments.seed, fd, stop)
+    except can.CanError as error:
+        tell("error", message=f"noise: bus {arguments.bus} is gone: {error}")
+        return 2
+    finally:
+        bus.shutdown()
+    tell("done", kinds=kinds)
+    return 0
+
+
+def open_for_noise(name: str) -> tuple[can.BusABC, bool]:
+    """The bus, and whether it takes frames of CAN FD. Raises BusError."""
+    try:
+        return open_bus(name, fd=True), True
+    except BusError:
+        return open_bus(name), False
+
+
+def differing_rows(one: np.ndarray, other: np.ndarray) -> int:
+    """How many rows of two tables of one shape differ in any bit."""
+    bits = [
+        np.ascontiguousarray(table).view(np.uint8).reshape(len(table), -1) for table in (one, other)
+    ]
+    return int(np.count_nonzero((bits[0] != bits[1]).any(axis=1)))
+
+
+def beside(
+    scenario: str, frames: int, seed: int, bus: str, progress: Callable[[str], None]
+) -> Outcome:
+    """Runs the scenario with its default law in one process, then on the bus with noise beside it,
+    until `frames` random frames are sent; compares what the train did.
+
+    :raises RunError: a node dies or falls silent.
+    """
+    loaded = load(scenario)
+    calibration = setup.calibration_for(loaded, loaded.scenario.law)
+    runs = range(1, 1 + ceil(1.2 * frames / BURST / loaded.ticks))
+    progress("without noise ...")
+    quiet = [result.truth for result, _ in sil.run(loaded, calibration, runs=runs, seed=seed)]
+    name = choose_bus(bus).name
+    noise = ["tools.noise", "--bus", name, "--frames", str(frames), "--seed", str(seed)]
+    ticks = changed = 0
+    with TemporaryDirectory(prefix="ato-hil-") as folder:
+        kept = Path(folder)
+        for node, event, bench in hil.run(
+            scenario=loaded.source,
+            controllers=[calibration],
+            buses=[name],
+            runs=runs,
+            seed=seed,
+            out=kept,
+            memory_file=None,
+            recorder_arguments=["--out", str(kept)],
+            others={"noise": noise},
+        ):
+            if node.name == PLANT and event["event"] == "run":
+                (truth,) = np.load(event["file"])
+                ticks += len(truth)
+                changed += differing_rows(truth, quiet[event["run"] - runs[0]])
+                progress(f"run {event['run']} of {runs[-1]}")
+            kinds = bench.nodes["noise"].said.get("done", {}).get("kinds", {})
+    identifiers = sum(len(messages) for messages in READ.values())
+    sent = sum(kinds.values())
+    expected = sent * SHARE_OF_MAILBOX_FRAMES * identifiers / 2048 * TAKEN
+    return Outcome(sent, dict(sorted(kinds.items())), len(runs), ticks, changed, expected)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
