@@ -10,9 +10,11 @@ import json
 import logging
 import os
 import select
+import signal
 import socket
 import struct
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,10 @@ FOREIGN = 1 << 32
 _LOG = logging.getLogger(__name__)
 
 _READ_BYTES = 1 << 16
+#: Shorter waits are those of loops that keep deadlines: poll counts in milliseconds, the socket's
+#: own time limit in ticks of the kernel, of up to 10 ms.
+EXACT_BELOW_S = 0.02
+_ANSWER_TIMEOUT_S = 1.0  # of a hub that is alive
 
 # A frame of `send_frames` and `recv_frames`: identifier, length and flags as one word, then the
 # payload as one signed word. A standard data frame of 8 bytes is (identifier | _MAILBOX, payload).
@@ -169,6 +175,16 @@ class HubBus(can.BusABC):
         """Return -1: frames that wait in this process would not make a descriptor readable."""
         return -1
 
+    def hub_answers(self) -> bool:
+        """Whether the hub does: one that is stopped keeps its connections, and says nothing."""
+        request = {"node": self._number, "filters": self._hub_filters}
+        try:
+            connection, _, _ = _ask(self._path, request, _ANSWER_TIMEOUT_S)
+        except OSError:
+            return False
+        connection.close()
+        return True
+
     def shutdown(self) -> None:
         """Leave the bus."""
         if self._is_shutdown:
@@ -221,7 +237,7 @@ class HubBus(can.BusABC):
     def _transmit(self, data: bytes, timeout: float | None = None) -> None:
         """Hand frames over to the hub."""
         with self._send_lock:
-            if timeout is not None and not _writable(self._socket, timeout):
+            if timeout is not None and not ready(self._socket, select.POLLOUT, timeout):
                 raise can.CanOperationError(f"{self.channel_info}: the hub takes no frames")
             try:
                 self._socket.sendall(data)
@@ -232,7 +248,9 @@ class HubBus(can.BusABC):
         """Make sure that a whole frame has been received; False when none came in time."""
         while len(self._received) - self._position < self._stamped_size:
             try:
-                if timeout is not None and timeout <= 0:
+                if timeout is not None and timeout < EXACT_BELOW_S:
+                    if timeout > 0 and not ready(self._socket, select.POLLIN, timeout):
+                        return False
                     chunk = self._socket.recv(_READ_BYTES, socket.MSG_DONTWAIT)
                 else:
                     if timeout != self._timeout:
@@ -283,6 +301,25 @@ def socket_path(channel: str) -> Path:
     return rendezvous.socket_path(SERVER, channel)
 
 
+def end_hung_hub(channel: str, hub_pid: int) -> None:
+    """Kill the hub of a channel, process `hub_pid`, if nodes can connect but get no answer: it
+    would stay for ever, and nobody could join."""
+    path = socket_path(channel)
+    try:
+        connection, _, _ = _ask(path, {"fd": False, "own": False, "filters": []}, _ANSWER_TIMEOUT_S)
+    except TimeoutError:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(hub_pid, signal.SIGKILL)
+        deadline = time.monotonic() + _ANSWER_TIMEOUT_S
+        while path.exists() and time.monotonic() < deadline:  # it takes a moment to die
+            time.sleep(0.01)
+            rendezvous.leave(path)
+    except OSError:
+        rendezvous.leave(path)  # it was killed, and its socket is left
+    else:
+        connection.close()
+
+
 def _filter_words(filters: CanFilters | None) -> list[tuple[int, int]]:
     """Filters of python-can as pairs of identifier word and mask.
 
@@ -299,11 +336,13 @@ def _filter_words(filters: CanFilters | None) -> list[tuple[int, int]]:
     return words
 
 
-def _ask(path: Path, request: dict[str, Any]) -> tuple[socket.socket, dict[str, int], bytes]:
+def _ask(
+    path: Path, request: dict[str, Any], timeout_s: float | None = None
+) -> tuple[socket.socket, dict[str, int], bytes]:
     """Open a connection with a request; returns it, the answer, and what came after the answer."""
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        connection.settimeout(rendezvous.CONNECT_TIMEOUT_S)
+        connection.settimeout(timeout_s or rendezvous.CONNECT_TIMEOUT_S)
         connection.connect(os.fspath(path))
         connection.sendall(json.dumps(request).encode() + b"\n")
         received = b""
@@ -320,8 +359,8 @@ def _ask(path: Path, request: dict[str, Any]) -> tuple[socket.socket, dict[str, 
     return connection, json.loads(answer), rest
 
 
-def _writable(connection: socket.socket, timeout: float) -> bool:
-    """Whether the socket takes data within `timeout` seconds."""
+def ready(connection: socket.socket, event: int, timeout: float) -> bool:
+    """Whether the socket takes or has data, or is closed, within `timeout` seconds."""
     poll = select.poll()
-    poll.register(connection, select.POLLOUT)
+    poll.register(connection, event)
     return bool(poll.poll(max(0.0, timeout) * 1000))

@@ -15,6 +15,7 @@ nobody can join them later. In python-can: `can.Bus(interface="atovcan", channel
 import errno
 import logging
 import os
+import select
 import socket
 import struct
 import time
@@ -27,7 +28,7 @@ from can.interfaces.socketcan import SocketcanBus
 from can.typechecking import CanFilters
 
 from can_dbc import private_vcan_server, rendezvous
-from can_dbc.hub import DEFAULT_CHANNEL, FOREIGN
+from can_dbc.hub import DEFAULT_CHANNEL, EXACT_BELOW_S, FOREIGN, ready
 
 SERVER = rendezvous.Server("atovcan", "private vcan", "+vcan.v1.sock", private_vcan_server)
 
@@ -96,7 +97,9 @@ class SocketBus(SocketcanBus):
         frames: list[tuple[int, int]] = []
         receive, unpack, to_integer = self.socket.recv, _FRAME.unpack_from, int.from_bytes
         flags = 0
-        if timeout is not None and timeout <= 0:
+        if timeout is not None and timeout < EXACT_BELOW_S:
+            if timeout > 0 and not ready(self.socket, select.POLLIN, timeout):
+                return frames
             flags = socket.MSG_DONTWAIT
         elif timeout != self._timeout:
             self._set_timeout(timeout)

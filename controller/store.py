@@ -50,7 +50,7 @@ def save(path: Path, calibration: Calibration, cells: np.ndarray, iteration: int
         calibration.scenario_digest.encode()[:64],
     )
     body = header + np.ascontiguousarray(cells).tobytes()
-    temporary = path.with_name(path.name + ".new")
+    temporary = _unfinished(path)
     with open(temporary, "wb") as stream:
         stream.write(body + struct.pack("<I", zlib.crc32(body)))
         stream.flush()
@@ -65,6 +65,15 @@ def save(path: Path, calibration: Calibration, cells: np.ndarray, iteration: int
         os.fsync(directory)
     finally:
         os.close(directory)
+
+
+def remove_unfinished(path: Path) -> None:
+    """Removes what a `save` has left that was killed."""
+    _unfinished(path).unlink(missing_ok=True)
+
+
+def _unfinished(path: Path) -> Path:
+    return path.with_name(path.name + ".new")
 
 
 def load(path: Path, calibration: Calibration) -> Stored:

@@ -35,6 +35,7 @@ from plant_sim import actuator, atp, brakes, radio
 from plant_sim.mail import received
 
 IDLE, ARMED, RUNNING, ENDED = 0, 1, 2, 3
+REAL_TIME = 1  # RUN_CTRL.Pace; 0 is the lockstep
 CONTROL_PERIOD_TICKS = 10  # RUN_CTRL comes every so many ticks
 NO_TARGET_M = 65535
 TICK_MASK = 0xFFFF
@@ -106,6 +107,7 @@ NODE_PARAMS = np.dtype(
 NODE_STATE = np.dtype(
     [
         ("run_state", np.int64),
+        ("pace", np.int64),  # set once by who keeps the time
         ("iteration", np.int64),
         ("tick", np.int64),
         ("timetable_rate", np.int64),  # of the run, less 1, 2^-24
@@ -160,6 +162,7 @@ def control_word(node: Any) -> Any:
     """RUN_CTRL."""
     return (
         put(RUN_CTRL.RunState, int64(node.run_state))
+        + put(RUN_CTRL.Pace, int64(node.pace))
         + put(RUN_CTRL.Iteration, int64(node.iteration))
         + put(RUN_CTRL.TimetableRate, int64(node.timetable_rate))
     )

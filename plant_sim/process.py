@@ -1,14 +1,18 @@
-"""The plant process: senses, sends, waits for the controllers' answers, moves the trains; lockstep.
+"""The plant process: senses, sends, waits for the controllers' answers, moves the trains.
 
-Each train has a bus of its own. The plant sends the frames of tick k on all of them and moves the
-trains only after FORCE_CMD has echoed tick k on every one. A missing answer ends the run with an
-error that names the silent node; what was recorded so far is kept. Internal: `ato-hil run` starts
-it.
+Each train has a bus of its own. In lockstep the plant sends the frames of tick k on all of them and
+moves the trains only after FORCE_CMD has echoed tick k on every one. In real time it sends them at
+the absolute deadline of tick k, and moves the trains with what it has at that of tick k + 1: a
+command that has not come is held. A plant that was held up lets the train go on for the ticks that
+it missed, but does not send what is no longer true: no burst of old frames, and tick and clock stay
+together. In both, silence ends the run with an error that names the silent node; what was recorded
+so far is kept. Internal: `ato-hil run` starts it.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import queue
 import sys
 import time
@@ -20,6 +24,7 @@ from typing import Any
 import can
 import numpy as np
 
+from can_dbc import pace
 from can_dbc.bus import BusError, open_bus, recv_frames, send_frames
 from can_dbc.child import Stop, follow_parent, tell
 from can_dbc.codec import ATO_STATUS, FORCE_CMD, MESSAGES, get
@@ -31,6 +36,7 @@ from plant_sim.scenario import ScenarioError, load
 FRAME_IDS = [message.frame_id for message in MESSAGES]
 TICK_START = FORCE_CMD.Tick.start
 REPEAT_S = 0.1  # RUN_CTRL outside a run
+EARLY_NS = 2_000_000  # before a deadline: the wait for frames may last that much too long
 PROGRESS_S = 0.1
 
 
@@ -117,10 +123,18 @@ def agree(
         if faults is not None and answered == before:
             return faults
     what = "armed" if run_state == plant.ARMED else "ended"
-    raise SilentNode(
-        f"{controller_name(here, train)} is silent: no ATO_STATUS({what}) for run {run}"
-        f" within {timeout_s:g} s"
-    )
+    raise silence(here, train, port.bus, f"ATO_STATUS({what}) for run {run}", timeout_s)
+
+
+def silence(
+    here: world.World, train: int, bus: can.BusABC, awaited: str, timeout_s: float
+) -> Exception:
+    """What to raise when nothing has come: SilentNode, or can.CanError if it is the hub."""
+    hub_answers = getattr(bus, "hub_answers", None)
+    if hub_answers is not None and not hub_answers():
+        return can.CanOperationError(f"its hub does not answer, no {awaited}")
+    name = controller_name(here, train)
+    return SilentNode(f"{name} is silent: no {awaited} within {timeout_s:g} s")
 
 
 def drive(
@@ -175,10 +189,98 @@ def answer(
         if stop.requested:
             raise Stopped
         if time.monotonic() >= deadline:
-            raise SilentNode(
-                f"{controller_name(here, train)} is silent: no FORCE_CMD for tick {tick}"
-                f" of run {run} within {timeout_s:g} s"
-            )
+            awaited = f"FORCE_CMD for tick {tick} of run {run}"
+            raise silence(here, train, port.bus, awaited, timeout_s)
+
+
+@dataclass
+class Heard:
+    """What a train's controller was last heard to say."""
+
+    at_ns: int
+    echo: int = -1  # FORCE_CMD.Tick
+
+    def answers(self, tick: int) -> bool:
+        """Whether that was the command for this tick, or a newer one: of a controller that has gone
+        on without the plant."""
+        return (self.echo - tick) & plant.TICK_MASK <= plant.TICK_MASK // 2
+
+
+def drive_in_real_time(
+    here: world.World,
+    ports: list[Port],
+    run: int,
+    truth: np.ndarray,
+    timing: np.ndarray,
+    spin_ns: int,
+    timeout_s: float,
+    stop: Stop,
+) -> None:
+    """One run by the clock; fills `truth` [trains, ticks] and `timing` [ticks] of pace.TIMING tick
+    by tick. Raises SilentNode or Stopped."""
+    chance = world.chances(here, run)
+    here.begin(here.params, here.state)
+    period_ns = round(here.members[0].scenario.period_s * 1e9)
+    lateness_ns, step_ns, latency_ns = (timing[name] for name in pace.TIMING.names or ())
+    for array in (truth, timing):
+        array.fill(0)  # its pages are there before they are needed
+    rx_fresh = here.rx["fresh"]
+    for port in ports:
+        port.inbox.begin_run(run)
+    deadline_ns = pace.now_ns() + period_ns
+    heard = [Heard(deadline_ns) for _ in ports]
+    next_progress_ns = 0
+    for tick in range(truth.shape[1]):
+        woke_ns = pace.wait_until(deadline_ns, spin_ns)
+        lateness_ns[tick] = woke_ns - deadline_ns
+        deadline_ns += period_ns  # of the next tick
+        here.sense(here.params, here.limits, here.state, chance, tick, here.tx)
+        sensed_ns = pace.now_ns()
+        if sensed_ns < deadline_ns:  # else the next tick's frames overwrite these
+            for train, port in enumerate(ports):
+                post(here, train, port.bus)
+            await_commands(ports, heard, tick, deadline_ns)
+        for port, of_train in zip(ports, heard, strict=True):
+            listen(port, of_train, 0.0)
+            port.inbox.close_tick()
+        began_ns = pace.now_ns()
+        answered = all(of_train.answers(tick) for of_train in heard)
+        latency_ns[tick] = began_ns - sensed_ns if answered else pace.NO_COMMAND
+        here.actuate_and_advance(here.params, here.track, here.state, chance, tick, here.rx, truth)
+        now_ns = pace.now_ns()
+        step_ns[tick] = sensed_ns - woke_ns + now_ns - began_ns
+        rx_fresh.fill(0)
+        for train, of_train in enumerate(heard):
+            if now_ns - of_train.at_ns > timeout_s * 1e9:
+                awaited = f"FORCE_CMD up to tick {tick} of run {run}"
+                raise silence(here, train, ports[train].bus, awaited, timeout_s)
+        if stop.requested:
+            raise Stopped
+        if now_ns >= next_progress_ns:
+            next_progress_ns = now_ns + round(PROGRESS_S * 1e9)
+            tell("progress", run=run, tick=tick)
+    for port in ports:
+        port.inbox.end_run()
+
+
+def await_commands(ports: list[Port], heard: list[Heard], tick: int, deadline_ns: int) -> None:
+    """Waits until all controllers have answered a tick, at most until the deadline of the next
+    one."""
+    for port, of_train in zip(ports, heard, strict=True):
+        while not of_train.answers(tick):
+            left_ns = deadline_ns - EARLY_NS - pace.now_ns()
+            if left_ns <= 0:
+                pace.wait_until(deadline_ns)
+                return
+            listen(port, of_train, left_ns * 1e-9)
+
+
+def listen(port: Port, heard: Heard, timeout_s: float) -> None:
+    """Takes what comes from a train's bus, or waits for the first of it."""
+    for frame_id, payload in collect(port, timeout_s):
+        if frame_id == FORCE_CMD.frame_id and intact(FORCE_CMD, payload):
+            heard.at_ns = pace.now_ns()
+            heard.echo = (payload >> TICK_START) & plant.TICK_MASK
 
 
 def echoes(tick: int, frame_id: int, payload: int) -> bool:
@@ -198,17 +300,24 @@ def one_run(
     arming_s: float,
     timeout_s: float,
     stop: Stop,
+    spin_ns: int | None,
 ) -> None:
-    """Arms, drives and ends one run; its truth is written even if it is cut short."""
+    """Arms, drives and ends one run; its truth is written even if it is cut short. In real time if
+    `spin_ns` is given, as `pace.wait_until` takes it."""
     ticks = here.ticks(run)
     truth = np.zeros((len(ports), ticks), plant.TRUTH)
+    timing = np.zeros(ticks, pace.TIMING)
     file = out / f"truth_{run}.npy"
+    timing_file = out / f"timing_{run}.npy"
     here.prepare(run)
     for train, port in enumerate(ports):
         agree(here, train, port, plant.ARMED, run, arming_s, stop)
     started = time.perf_counter()
     try:
-        drive(here, ports, run, truth, timeout_s, stop)
+        if spin_ns is None:
+            drive(here, ports, run, truth, timeout_s, stop)
+        else:
+            drive_in_real_time(here, ports, run, truth, timing, spin_ns, timeout_s, stop)
     except (SilentNode, Stopped):
         done = int(here.state[0]["node"]["tick"])
         np.save(file, truth[:, :done])
@@ -216,6 +325,9 @@ def one_run(
         raise
     seconds = time.perf_counter() - started
     np.save(file, truth)
+    if spin_ns is not None:
+        np.save(timing_file, timing)
+        gc.collect()  # it is off while the clock runs
     faults = [
         agree(here, train, port, plant.ENDED, run, 2 * timeout_s, stop)
         for train, port in enumerate(ports)
@@ -226,6 +338,7 @@ def one_run(
         ticks=ticks,
         seconds=seconds,
         file=str(file),
+        **({} if spin_ns is None else {"timing": str(timing_file)}),
         faults=faults,
         refused=sum(int(state["node"]["refused"]) for state in here.state),
     )
@@ -246,6 +359,8 @@ def main() -> int:
         "--patience", type=float, default=2.0, help="longest wait for the first answer, s"
     )
     parser.add_argument("--faults", type=Path, metavar="DIR", help="with the plan and the logs")
+    parser.add_argument("--realtime", action="store_true", help="by the clock, not in lockstep")
+    parser.add_argument("--spin-us", type=int, default=0, help="busy wait before each deadline")
     arguments = parser.parse_args()
     stop = Stop()
     commands: queue.Queue[dict[str, Any]] = queue.Queue()
@@ -260,13 +375,19 @@ def main() -> int:
         opened.close()
         tell("error", message=str(error))
         return 1
-    tell("ready")
+    refused = []
+    spin_ns = None
+    if arguments.realtime:
+        spin_ns = 1000 * arguments.spin_us
+        here.state["node"]["pace"] = plant.REAL_TIME
+        refused = pace.prepare(bus.hub_pid for bus in buses if hasattr(bus, "hub_pid"))
+    tell("ready", refused=refused)
     try:
         while commands.empty() and not stop.requested:
             time.sleep(0.005)
         arming_s = arguments.patience
         for run in range(arguments.first_run, arguments.last_run + 1):
-            one_run(here, ports, run, arguments.out, arming_s, arguments.timeout, stop)
+            one_run(here, ports, run, arguments.out, arming_s, arguments.timeout, stop, spin_ns)
             arming_s = 2 * arguments.timeout
     except Stopped:
         return 0

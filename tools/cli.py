@@ -59,6 +59,7 @@ class Pace(StrEnum):
     """Who keeps the time."""
 
     lockstep = "lockstep"
+    realtime = "realtime"
 
 
 class Picture(StrEnum):
@@ -234,8 +235,17 @@ def run(
         ),
     ] = "auto",
     pace: Annotated[
-        Pace, typer.Option(help="lockstep: as fast as the bus, deterministic.")
+        Pace,
+        typer.Option(
+            help="lockstep: as fast as the bus, deterministic; realtime: by the clock (HIL)."
+        ),
     ] = Pace.lockstep,
+    spin_us: Annotated[
+        int,
+        typer.Option(
+            min=0, max=5000, help="Real time: the plant's busy wait before each deadline, µs."
+        ),
+    ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise and disturbance.")] = 1,
     out: Annotated[
         Path | None,
@@ -269,7 +279,12 @@ def run(
         os.execve(sys.executable, [sys.executable, "-m", "tools.cli", *sys.argv[1:]], environment)
     with one_line_for_bad_input():
         nodes = tuple(dict.fromkeys(node.value for node in external or ()))
-        _run(scenario, law, runs, mode, bus, seed, out, memory, trace, record, nodes, faults)
+        _run(
+            *(scenario, law, runs, mode, bus, seed, out, memory, trace, record, nodes),
+            faults=faults,
+            pace=pace.value,
+            spin_us=spin_us,
+        )
 
 
 @contextmanager
@@ -297,6 +312,7 @@ def _run(
     record: Path | None,
     external: tuple[str, ...],
     faults: Path | None,
+    **more: Any,
 ) -> None:
     from controller.registry import law_label
     from plant_sim.scenario import load
@@ -312,6 +328,7 @@ def _run(
     options = session.Options(
         *(scenario, law, runs, mode.value, bus, seed, folder, memory, trace, record, external),
         faults=faults,
+        **more,
     )
     screen = Screen(mode)
     try:
@@ -326,7 +343,10 @@ def _run(
     _print_table(screen)
     if External.plant in external:
         console.print("errors and energy are what the bus shows: measured, commanded")
-    console.print(f"digest  {summary['digest']}")
+    if "timing" in summary:
+        _print_timing(summary["timing"])
+    repeats = "" if summary["digest_repeats"] else "   (in real time another one each time)"
+    console.print(f"digest  {summary['digest']}{repeats}")
     console.print(f"summary {folder / 'summary.json'}", soft_wrap=True)
     if trace:
         trace_file = folder / "trace.rrd"
@@ -337,6 +357,18 @@ def _run(
         console.print(f"faults  {log}   (injected: {injected or 'none'})", soft_wrap=True)
     if record is not None:
         console.print(f"record  {record}   (again: ato-hil replay {record})", soft_wrap=True)
+
+
+def _print_timing(timing: dict[str, Any]) -> None:
+    from tools import realtime
+
+    table = Table("real time, µs", "p50", "p99", "p99.9", "max", header_style="bold")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for row in realtime.rows(timing):
+        table.add_row(*row)
+    console.print(table)
+    console.print(realtime.verdict(timing), soft_wrap=True)
 
 
 @app.command()
@@ -943,6 +975,44 @@ def verify(
     if rows[-1].state == "failed":
         last = rows[-1]
         raise _fail(f"{last.name} of {last.subject} failed: {last.result}", EXIT_BAD_INPUT)
+
+
+@app.command()
+def endurance(
+    times: Annotated[int, typer.Option(min=1, help="Sessions.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of victims and moments.")] = 1,
+    out: Annotated[
+        Path, typer.Option(help="Folder of endurance.json, and of the trials that failed.")
+    ] = Path("runs/endurance"),
+) -> None:
+    """Kill and stop nodes of sessions at random moments: each has to end named and clean."""
+    from tools import endurance as trials
+    from tools import files
+
+    done = []
+    with one_line_for_bad_input(), console.status("") as status:
+        for outcome in trials.campaign(trials.plan(times, seed), out):
+            done.append(outcome)
+            status.update(f"{len(done)} of {times} sessions; last: {outcome.cause}")
+            for complaint in outcome.complaints:
+                text = f"trial {outcome.trial.number}: {complaint} ({outcome.cause})"
+                console.print(text, style="red", soft_wrap=True, markup=False)
+            rows = [each.as_json() for each in done]
+            files.write_json(out / "endurance.json", {"schema": 1, "seed": seed, "trials": rows})
+    headings = ("node", "signal", "sessions", "named and clean", "longest to the end, s")
+    table = Table(*headings, header_style="bold")
+    kinds = dict.fromkeys((each.trial.victim, each.trial.signal) for each in done)
+    for victim, number in kinds:
+        of_kind = [
+            each for each in done if (each.trial.victim, each.trial.signal) == (victim, number)
+        ]
+        clean = sum(not each.complaints for each in of_kind)
+        longest = max(each.seconds for each in of_kind)
+        table.add_row(victim, number.name, f"{len(of_kind)}", f"{clean}", f"{longest:.1f}")
+    console.print(table)
+    failed = sum(bool(each.complaints) for each in done)
+    if failed:
+        raise _fail(f"{failed} of {times} sessions did not end as demanded", EXIT_BAD_INPUT)
 
 
 def main() -> None:

@@ -18,6 +18,7 @@ from can_dbc.codec import (
     ATO_ESTIMATE,
     FORCE_CMD,
     RUN_CTRL,
+    TRAIN_POSITION,
     choices,
     database,
     decode_column,
@@ -26,6 +27,7 @@ from can_dbc.codec import (
 
 RUN_STATES = choices("RUN_CTRL", "RunState")
 ARMED, RUNNING, ENDED = (RUN_STATES[name] for name in ("armed", "running", "ended"))
+TICK_PERIOD = 1 << 16  # of the ticks on the bus
 
 FRAME = np.dtype(
     [
@@ -101,6 +103,21 @@ def ticks_of(frame_ids: np.ndarray) -> np.ndarray:
     """Tick of each frame of a run from its start: FORCE_CMD is the last frame of its tick."""
     closes = frame_ids == FORCE_CMD.frame_id
     return np.asarray(np.cumsum(closes) - closes)
+
+
+def ticks_by_echo(frame_ids: np.ndarray, words: np.ndarray, tick: int) -> tuple[np.ndarray, int]:
+    """Tick of each frame, and the tick after them, in a part of a run in real time that begins at
+    `tick`: a command may be missing or late there, so it is what TRAIN_POSITION and FORCE_CMD say,
+    as far as it rises."""
+    opens = frame_ids == TRAIN_POSITION.frame_id
+    closes = frame_ids == FORCE_CMD.frame_id
+    said = np.where(opens, decode_column(words, TRAIN_POSITION.Tick), 0)
+    said = np.where(closes, decode_column(words, FORCE_CMD.Tick) + 1, said)
+    said = np.concatenate([[tick], said[opens | closes]])
+    steps = (np.diff(said) + TICK_PERIOD // 2) % TICK_PERIOD - TICK_PERIOD // 2
+    reached = np.maximum.accumulate(tick + np.concatenate([[0], np.cumsum(steps)]))
+    ticks = reached[np.cumsum(opens | closes) - closes]
+    return ticks, int(reached[-1])
 
 
 def columns(frames: np.ndarray, message: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -2,13 +2,15 @@
 process starts, watches and ends them. A controller or plant that is not ours is started by its
 owner; an observer watches it instead.
 
-A process that dies, a node that falls silent or Ctrl-C ends the run within two seconds, names the
-cause, keeps the traces so far, and leaves no process and no socket behind.
+A process that dies, a node that falls silent or Ctrl-C ends the run within two seconds, a process
+that is stopped or a plant that hangs within ten; the cause is named, the traces so far are kept,
+and no process and no socket is left behind.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import queue
 import subprocess
 import sys
@@ -21,7 +23,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
+from can_dbc.hub import end_hung_hub
 from controller import calibration as calibrations
+from controller import store
 from controller.calibration import Calibration
 from tools.observer import CONTROLLER, PATIENCE_S, PLANT
 
@@ -29,7 +33,9 @@ READY_TIMEOUT_S = 300.0  # the first start compiles
 # The plant's own limit while the observer judges a foreign controller, and names what is wrong.
 EXTERNAL_TIMEOUT_S = 3.0
 STOP_TIMEOUT_S = 0.7  # of a node that was asked to end
-RECORDER_TIMEOUT_S = 60.0  # from the end of the last run to the recorder's account of it
+STOPPED_S = 2.0  # a process may be stopped for as long
+SILENCE_S = 10.0  # longest without a word of the plant
+ACCOUNT_TIMEOUT_S = 60.0  # from the end of the last run to every node's account of it
 
 
 class RunError(Exception):
@@ -44,6 +50,8 @@ class Node:
     process: subprocess.Popen[str]
     log: Path
     said: dict[str, dict[str, Any]] = field(default_factory=dict)  # last event of each kind
+    heard_s: float = field(default_factory=time.monotonic)  # when it last said something
+    stopped_s: float | None = None  # since when it is known to be stopped
 
     def command(self, **fields: Any) -> None:
         """One JSON line to the node; a node that is gone is noticed elsewhere."""
@@ -55,19 +63,39 @@ class Node:
             pass
 
 
+@dataclass(frozen=True)
+class RealTime:
+    """A session by the clock."""
+
+    period_us: int  # control period
+    ticks: int  # of the longest run
+    spin_us: int  # busy wait of the plant before each deadline
+
+
 class Bench:
     """The nodes of one run. Use as a context manager: leaving it ends every node."""
 
-    def __init__(self, out: Path) -> None:
+    def __init__(self, out: Path, buses: list[str]) -> None:
         self.out = out
+        self.buses = buses
         self.nodes: dict[str, Node] = {}
+        self.accountants: list[Node] = []  # besides the leader: each tells of a run when it is over
         self.events: queue.Queue[tuple[Node, dict[str, Any]]] = queue.Queue()
 
     def __enter__(self) -> Bench:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.end()
+        if kind is not None and "recorder" in self.nodes:
+            hubs = self.nodes["recorder"].said.get("ready", {}).get("hubs", ())
+            for bus, hub in zip(self.buses, hubs, strict=False):
+                if hub is not None:
+                    end_hung_hub(bus.partition(":")[2], hub)
+
+    def over(self, run: int | None) -> bool:
+        """Whether every node has given its account of a run."""
+        return all(last_run(node) == run for node in self.accountants)
 
     def start(self, name: str, arguments: list[str]) -> Node:
         """A child process that speaks JSON lines; its stderr goes to OUT/NAME.log."""
@@ -97,11 +125,13 @@ class Bench:
     def next_event(self, timeout_s: float) -> tuple[Node, dict[str, Any]] | None:
         """The next event of any node, None after `timeout_s`. Raises RunError for an error or a
         node that died."""
+        self._refuse_stopped()
         try:
             node, event = self.events.get(timeout=timeout_s)
         except queue.Empty:
             return None
         node.said[event["event"]] = event
+        node.heard_s = time.monotonic()
         if event["event"] == "error":
             raise RunError(event["message"])
         if event["event"] == "closed":
@@ -111,6 +141,17 @@ class Bench:
                     f"the {node.name} process ended ({_exit_text(code)}){_last_line(node)}"
                 )
         return node, event
+
+    def _refuse_stopped(self) -> None:
+        """Raises RunError for a process that a signal has stopped, and not for a moment."""
+        now_s = time.monotonic()
+        for node in self.nodes.values():
+            if not _is_stopped(node):
+                node.stopped_s = None
+            elif node.stopped_s is None:
+                node.stopped_s = now_s
+            elif now_s - node.stopped_s > STOPPED_S:
+                raise RunError(f"the {node.name} process is stopped, by a signal")
 
     def wait_ready(self) -> None:
         """Until every node has said that it is ready."""
@@ -124,6 +165,9 @@ class Bench:
     def end(self) -> None:
         """Ends the other nodes, then the recorder, which writes what it has; kills what does not
         end."""
+        for node in self.nodes.values():
+            if _is_stopped(node):
+                node.process.kill()
         driving = [node for node in self.nodes.values() if node.name != "recorder"]
         for node in driving:
             if node.process.poll() is None:
@@ -139,6 +183,16 @@ class Bench:
         for node in self.nodes.values():
             if node.log.exists() and node.log.stat().st_size == 0:
                 node.log.unlink()
+
+
+def _is_stopped(node: Node) -> bool:
+    if not hasattr(os, "waitid") or node.process.returncode is not None:
+        return False
+    flags = os.WSTOPPED | os.WNOHANG | os.WNOWAIT
+    try:
+        return os.waitid(os.P_PID, node.process.pid, flags) is not None
+    except ChildProcessError:  # it has ended
+        return False
 
 
 def _wait(node: Node, timeout_s: float) -> None:
@@ -184,6 +238,7 @@ def run(
     cars: int = 0,
     faults: Path | None = None,
     others: Mapping[str, list[str]] | None = None,
+    real_time: RealTime | None = None,
 ) -> Generator[tuple[Node, dict[str, Any], Bench], None, None]:
     """Events of the nodes, `ready` of each first, until all runs are done and recorded; see the
     `tell` calls of the processes.
@@ -191,15 +246,22 @@ def run(
     `buses` has an entry for each train, and so has `controllers`, or none where the controller is
     one of the `external` nodes; `cars` are those that the plant takes a force for, each by itself;
     `faults` is the folder of can_dbc.faults.receiver; `others` are further nodes by name, modules
-    with their arguments.
+    with their arguments. In lockstep, or in `real_time`.
 
     Raises RunError with one line if a node dies, falls silent or reports an error.
     """
     on_buses = [word for bus in buses for word in ("--bus", bus)]
-    with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, Bench(out) as bench:
-        injected = [] if faults is None else ["--faults", str(faults)]
-        recorder_arguments = [*recorder_arguments, *injected]
+    injected = [] if faults is None else ["--faults", str(faults)]
+    recorder_arguments = [*recorder_arguments, *injected]
+    with (
+        ExitStack() as afterwards,
+        tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch,
+        Bench(out, buses) as bench,
+    ):
+        if memory_file is not None:
+            afterwards.callback(store.remove_unfinished, memory_file)
         recorder = bench.start("recorder", ["tools.recorder", *on_buses, *recorder_arguments])
+        bench.accountants.append(recorder)
         if external:
             watched = [word for name in external for word in ("--external", name)]
             watched += ["--cars", str(cars), "--runs", str(len(runs))]
@@ -210,6 +272,8 @@ def run(
             if CONTROLLER in external:
                 plant_arguments += ["--patience", f"{PATIENCE_S + EXTERNAL_TIMEOUT_S}"]
                 plant_arguments += ["--timeout", f"{EXTERNAL_TIMEOUT_S}"]
+            if real_time is not None:
+                plant_arguments += ["--realtime", "--spin-us", str(real_time.spin_us)]
             leader = bench.start(PLANT, ["plant_sim.process", *on_buses, *plant_arguments])
         for train, calibration in enumerate(controllers):
             name = CONTROLLER if len(controllers) == 1 else f"{CONTROLLER}-{train + 1}"
@@ -217,7 +281,14 @@ def run(
             if memory_file is not None:
                 arguments += ["--memory", str(memory_file)]
             arguments += [*injected, "--train", str(train)]
-            bench.start(name, ["controller.process", "--bus", buses[train], *arguments])
+            if real_time is not None:
+                folder = Path(scratch, f"{name}-timing")
+                folder.mkdir()
+                arguments += ["--realtime", str(folder), "--ticks", str(real_time.ticks)]
+                arguments += ["--period-us", str(real_time.period_us)]
+            node = bench.start(name, ["controller.process", "--bus", buses[train], *arguments])
+            if real_time is not None:
+                bench.accountants.append(node)
             if train == 0:
                 bench.wait_ready()  # what the first controller compiles, the others load
         for name, arguments in (others or {}).items():
@@ -227,17 +298,22 @@ def run(
             yield node, node.said["ready"], bench
         leader.command(command="start")
         deadline = None
-        while "done" not in leader.said or _last_run(recorder) != _last_run(leader):
+        while "done" not in leader.said or not bench.over(last_run(leader)):
             got = bench.next_event(0.5)
             if got is not None:
                 yield (*got, bench)
+            elif not external and time.monotonic() - leader.heard_s > SILENCE_S:
+                raise RunError(f"the {leader.name} process hangs: no word for {SILENCE_S:g} s")
             if "done" in leader.said:
-                deadline = deadline or time.monotonic() + RECORDER_TIMEOUT_S
+                leader.heard_s = time.monotonic()  # it has no more to say
+                deadline = deadline or time.monotonic() + ACCOUNT_TIMEOUT_S
                 if time.monotonic() > deadline:  # it may have lost just the frame that says so
-                    raise RunError(f"the recorder has not seen the end of run {_last_run(leader)}")
+                    run = last_run(leader)
+                    late = [node.name for node in bench.accountants if last_run(node) != run]
+                    raise RunError(f"the {', '.join(late)} has not seen the end of run {run}")
 
 
-def _last_run(node: Node) -> int | None:
+def last_run(node: Node) -> int | None:
     """The last run that a node has told the end of."""
     run: int | None = node.said.get("run", {}).get("run")
     return run

@@ -1,23 +1,24 @@
 """The tap: a third node that only listens, and keeps every frame of every run.
 
 A run lasts from RUN_CTRL(running) to RUN_CTRL of any other state or iteration; FORCE_CMD closes a
-tick. Frames between runs are not recorded. Received frames go into one growing array for each run
-and are decoded by whole columns, a thousand ticks at a time, so that a run that is cut short
-leaves its trace. Internal: `ato-hil run` starts it.
+tick, in real time the one that it names. Frames between runs are not recorded. Received frames go
+into one growing array for each run and are decoded by whole columns, a thousand ticks at a time, so
+that a run that is cut short leaves its trace. Internal: `ato-hil run` starts it.
 
 It says on stdout, in JSON lines:
 
-    {"event": "ready"}                                     it listens
+    {"event": "ready", "hubs": [4711]}                     it listens; processes of the buses
     {"event": "run", "run": 1, "ticks": …, "frames": …,    a run has ended on every bus; lost frames
      "lost": {…}, "dropped": 0, "foreign": 0,              by message, as the buses counted them,
      "digest": "…", "digests": ["…"],                      frames of other kinds, digest of all runs
      "complete": true}                                     so far, and that of each train
     {"event": "error", "message": "…"}                     it ends early
 
-and takes on stdin:
+and takes on stdin, where a file is deleted when it has been read:
 
     {"command": "reference", "run": 1, "file": "x.npy"}    of a run on a timetable of its own
     {"command": "truth", "run": 1, "file": "truth.npy"}    true state of the plant, for the trace
+    {"command": "timing", "run": 1, "file": "timing.npy"}  how punctual a run in real time was
     {"command": "summary", "run": 1, "row": {…}}           the run's row of summary.json, likewise
     {"command": "stop"}                                    as SIGTERM, SIGINT and the end of stdin
 """
@@ -45,7 +46,7 @@ import numpy as np
 from can_dbc import e2e
 from can_dbc.bus import FOREIGN, open_bus, recv_frames
 from can_dbc.child import Stop, follow_parent, tell
-from can_dbc.codec import FORCE_CMD, MESSAGES, RUN_CTRL, decode_column
+from can_dbc.codec import FORCE_CMD, MESSAGES, RUN_CTRL, decode_column, get
 from can_dbc.faults import injected
 from can_dbc.hub_server import ERROR
 from tools.frames import (
@@ -56,6 +57,7 @@ from tools.frames import (
     columns,
     digest_of_line,
     run_controls,
+    ticks_by_echo,
     ticks_of,
 )
 from tools.trace import Reference, TraceWriter
@@ -129,6 +131,7 @@ class Recorder:
         """
         self.run: int | None = None  # number of the current run
         self.tick = 0  # of the current run
+        self._real_time = False
         self._trace = trace
         self._keep_frames = keep_frames
         self._train = train
@@ -164,7 +167,7 @@ class Recorder:
                 self._append(frame_ids[start:at], words[start:at])
                 self._end_run(state == ENDED and number == self.run, dropped)
             if self.run is None and state == RUNNING:
-                self._begin_run(number)
+                self._begin_run(number, bool(get(int(words[at]), RUN_CTRL.Pace)))
                 start = at
         if self.run is not None:
             self._append(frame_ids[start:], words[start:])
@@ -172,7 +175,7 @@ class Recorder:
                 self._log(int(np.searchsorted(self.frames["tick"], self.tick)))
 
     def obey(self, command: dict[str, Any]) -> None:
-        """Log what the parent knows of a run: `reference`, `truth` or `summary`."""
+        """Log what the parent knows of a run: `reference`, `truth`, `timing` or `summary`."""
         if self._trace is None:
             return
         if command["command"] == "reference":
@@ -181,6 +184,8 @@ class Recorder:
         elif command["command"] == "truth":
             tables = np.atleast_2d(np.load(command["file"]))  # of all trains
             self._trace.truth(command["run"], tables[self._train], self._train)
+        elif self._train == 0 and command["command"] == "timing":
+            self._trace.timing(command["run"], np.load(command["file"]))
         elif self._train == 0:
             self._trace.run_summary(command["run"], command["row"])
 
@@ -195,8 +200,8 @@ class Recorder:
         if self._trace is not None and self._train == 0:
             self._trace.close()
 
-    def _begin_run(self, number: int) -> None:
-        self.run = number
+    def _begin_run(self, number: int, real_time: bool) -> None:
+        self.run, self._real_time = number, real_time
         self.tick = self._count = self._logged = self._logged_tick = 0
 
     def _append(self, frame_ids: np.ndarray, words: np.ndarray) -> None:
@@ -206,11 +211,14 @@ class Recorder:
             larger[: self._count] = self.frames
             self._rows = larger
         rows = self._rows[self._count : end]
-        rows["tick"] = self.tick + ticks_of(frame_ids)
         rows["frame_id"] = frame_ids
         rows["payload"] = words
         self._count = end
-        self.tick += int(np.count_nonzero(frame_ids == FORCE_CMD.frame_id))
+        if self._real_time:
+            rows["tick"], self.tick = ticks_by_echo(frame_ids, words, self.tick)
+        else:
+            rows["tick"] = self.tick + ticks_of(frame_ids)
+            self.tick += int(np.count_nonzero(frame_ids == FORCE_CMD.frame_id))
 
     def _log(self, end: int) -> None:
         """Bring the trace up to row `end`."""
@@ -294,6 +302,8 @@ def record(
             else:
                 for _bus, recorder in taps:
                     recorder.obey(command)
+                if "file" in command:
+                    Path(command["file"]).unlink()
         if heard:
             time.sleep(PAUSE_S * len(taps))
     deadline = time.monotonic() + DRAIN_S
@@ -379,7 +389,7 @@ def main() -> int:
         return 1
     e2e.check(0, -1, RUN_CTRL.data_id)  # compiles, or loads what was compiled before
     gc.freeze()  # the garbage collector need not look at all of Rerun again and again
-    tell("ready")
+    tell("ready", hubs=[getattr(bus, "hub_pid", None) for bus, _ in taps])
     status = 0
     try:
         record(taps, commands, stop)

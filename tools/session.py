@@ -3,16 +3,18 @@
 Modes: `sil` (one compiled loop), `mil` (the same loop interpreted, in a process started with
 ATO_HIL_INTERPRETED=1), `hil` (three processes on a bus). All give the same digest. In HIL
 plant or controller, or both, may be external: started by their owner, known by their frames alone.
+Only HIL can also go by the clock, pace `realtime`: its digest depends on what was in time.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import msgspec
@@ -25,7 +27,7 @@ from controller.calibration import Calibration
 from controller.interface import fault_names
 from controller.registry import is_file, load_law
 from plant_sim.scenario import FOLDER, Loaded, at_rate, load, members
-from tools import environment, hil, line, record, setup, sil, sil_faults
+from tools import environment, hil, line, realtime, record, setup, sil, sil_faults
 from tools.files import write_json, write_text
 from tools.frames import LineDigest, timetable_rate
 from tools.hil import RunError
@@ -37,6 +39,7 @@ SCHEMA = 1
 EXTERNAL_LAW = "external"  # of a controller that is not ours
 RUNS_MAX = 4095  # Iteration has 12 bits
 BACKLOG_RUNS = 4  # that a recording may be behind
+LOCKSTEP, REALTIME = "lockstep", "realtime"
 BUSY_S = 0.3  # how long to listen for other traffic, on all buses together
 
 
@@ -76,6 +79,8 @@ class Options:
     record: Path | None = None  # recording of the frames
     external: tuple[str, ...] = ()  # nodes that are not ours: plant, controller
     faults: Path | None = None  # file of faults to inject
+    pace: str = LOCKSTEP
+    spin_us: int = 0  # real time: busy wait of the plant before each deadline
 
 
 @dataclass
@@ -91,6 +96,7 @@ class Session:
     summary: dict[str, Any] = field(default_factory=dict)
     recording: record.Recording | None = None
     plan: faults.Plan | None = None  # of the faults of the bus
+    account: realtime.Account | None = None  # of a session in real time
 
 
 def run(options: Options, listener: Listener) -> dict[str, Any]:
@@ -104,6 +110,8 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     trains = members(loaded)
     if len(trains) > 1:
         _refuse_what_is_for_one_train(options)
+    if options.pace == REALTIME:
+        _refuse_without_clock(options)
     law, calibrations, runs = _controllers(options, trains)
     if runs[-1] > RUNS_MAX:
         raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
@@ -122,10 +130,11 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         "mode": options.mode,
         "bus": "none",
         "external": list(options.external),
-        "pace": "lockstep",
+        "pace": options.pace,
         "seed": options.seed,
         "scenario_digest": loaded.digest,
         "digest": "",
+        "digest_repeats": options.pace == LOCKSTEP,
         "controller": {"state_bytes": 0, "memory_bytes": 0},
         "runs": [],
         "versions": environment.versions(),
@@ -146,6 +155,8 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         session.summary["ended_early"] = "interrupted"
         raise
     finally:
+        if session.account is not None:
+            session.summary["timing"] = session.account.summary()
         write_json(options.out / "summary.json", session.summary)
     return session.summary
 
@@ -181,6 +192,14 @@ def _refuse_what_is_for_one_train(options: Options) -> None:
     ):
         if asked:
             raise SessionError(f"{options.scenario}: a line of several trains takes no {what}")
+
+
+def _refuse_without_clock(options: Options) -> None:
+    """Raises SessionError for what has no clock, or one of its own."""
+    if options.mode != "hil":
+        raise SessionError(f"pace {REALTIME} needs mode hil, this is {options.mode}")
+    if PLANT in options.external:
+        raise SessionError(f"pace {REALTIME}: an external plant keeps its own time")
 
 
 def _controllers(options: Options, trains: list[Loaded]) -> tuple[str, list[Calibration], range]:
@@ -241,10 +260,12 @@ def _finish_run(
     seconds: float,
     latched: list[list[str]],
     frames_lost: int = 0,
+    timing: Mapping[str, int] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """The row of a run, added to the summary and shown; a list has an entry for each train.
 
-    `frames_lost` are frames that were on the buses and are not in `frames`.
+    `frames_lost` are frames that were on the buses and are not in `frames`; `timing` is how
+    punctual a run in real time was.
     """
     if session.recording is not None:
         session.recording.add(run, frames[0])
@@ -254,6 +275,7 @@ def _finish_run(
         **measured,
         "ticks_per_s": len(truths[0]) / seconds,
         "frames_lost": frames_lost,
+        **timing,
         "faults": latched[0],
     }
     if "trains" in measured:
@@ -415,6 +437,11 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
     if PLANT not in options.external:  # which may well be there, and announce itself
         for bus in buses:
             _refuse_busy_bus(bus, BUSY_S / len(buses))
+    real_time = None
+    if options.pace == REALTIME:
+        period_us = round(loaded.scenario.period_s * 1e6)
+        real_time = hil.RealTime(period_us, loaded.ticks, options.spin_us)
+        session.account = realtime.Account(period_us, options.spin_us)
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, _recording(session):
         kept = Path(scratch)
         if session.plan is not None:
@@ -431,6 +458,7 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
             external=options.external,
             cars=_cars(loaded),
             faults=None if session.plan is None else kept,
+            real_time=real_time,
         )
         try:
             with closing(events):  # whatever ends the session ends the nodes
@@ -467,7 +495,12 @@ def _on_event(
     leader = "observer" if PLANT in session.options.external else PLANT
     if kind == "progress":
         session.listener.progress(event["run"], event["tick"])
-    elif kind == "ready" and name.startswith(CONTROLLER):
+        return
+    if kind == "ready" and session.account is not None and event.get("refused"):
+        if not session.account.refused:
+            session.listener.note(realtime.refusals({name: event["refused"]}))
+        session.account.refused[name] = event["refused"]
+    if kind == "ready" and name.startswith(CONTROLLER):
         session.summary["controller"] = {
             "state_bytes": event["state_bytes"],
             "memory_bytes": event["memory_bytes"],
@@ -475,11 +508,10 @@ def _on_event(
     elif kind == "ready" and name == "observer":
         nodes = " and ".join(session.options.external)
         session.listener.note(f"ready; the {nodes} may join within {PATIENCE_S:g} s")
-    elif name in (leader, "recorder") and kind == "run":
-        led, recorder = bench.nodes[leader].said, bench.nodes["recorder"].said
-        run = event["run"]
-        if led.get("run", {}).get("run") == run and recorder.get("run", {}).get("run") == run:
-            _on_run(session, bench, led["run"], recorder["run"], kept)
+    elif kind == "run":
+        led, run = bench.nodes[leader].said, event["run"]
+        if hil.last_run(bench.nodes[leader]) == run and bench.over(run):
+            _on_run(session, bench, led["run"], bench.nodes["recorder"].said["run"], kept)
 
 
 def _on_run(
@@ -487,14 +519,16 @@ def _on_run(
 ) -> None:
     """The node that leads the runs, and the recorder, have both finished one."""
     run = led["run"]
-    if session.options.external and recorder["ticks"] != led["ticks"]:
+    in_lockstep = session.account is None
+    if in_lockstep and session.options.external and recorder["ticks"] != led["ticks"]:
         raise RunError(
             f"run {run} has {led['ticks']} ticks, the recorder heard {recorder['ticks']}:"
             " it began before the recorder was ready, or frames were lost"
         )
     _set_digest(session, recorder["digest"], recorder["digests"])
     lost, dropped = recorder["lost"], recorder["dropped"]
-    frames_lost = max(dropped, sum(lost.values()))
+    # In real time a node leaves out what it cannot send in time: gaps in the counters are no loss.
+    frames_lost = max(dropped, sum(lost.values()) if in_lockstep else 0)
     if frames_lost:
         session.listener.note(
             f"run {run}: the recorder missed {frames_lost} frames"
@@ -527,6 +561,20 @@ def _on_run(
             file = kept / f"columns_{run}_{number}.npy"
             np.save(file, table)
             tap.command(command="truth", run=run, file=str(file))
+    timing = {}
+    if session.account is not None:
+        of_nodes = {}
+        for name, node in bench.nodes.items():
+            if "timing" in node.said.get("run", {}):
+                file = Path(node.said["run"]["timing"])
+                of_nodes[name] = np.load(file)
+                file.unlink()
+        timing = session.account.add(of_nodes)
+        file = kept / f"timing_{run}.npy"
+        np.save(file, realtime.table(of_nodes))
+        tap.command(command="timing", run=run, file=str(file))
     latched = [fault_names(bits) for bits in led["faults"]]
-    row = _finish_run(session, run, frames, truths, led["seconds"], latched, frames_lost)
+    row = _finish_run(
+        session, run, frames, truths, led["seconds"], latched, frames_lost, timing=timing
+    )
     tap.command(command="summary", run=run, row=row)

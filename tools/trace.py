@@ -9,6 +9,7 @@ beside it in a branch of its own:
     /truth/FIELD/run_NN     true state of the plant, and its errors against the reference
     /reference/FIELD        the reference as planned
     /reference/FIELD/run_NN that of a run on a timetable of its own
+    /timing/run_NN/FIELD    how punctual the nodes were in real time, µs
     /runs/KEY               the summary of each run, on timeline `run`
     /events                 texts
 
@@ -28,6 +29,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
+from can_dbc import pace
 from can_dbc.codec import (
     ATO_RADIO,
     ATO_STATUS,
@@ -230,6 +232,7 @@ ERRORS = {"position_error_m": "position_m", "speed_error_m_s": "speed_m_s"}
 _UNITS = (
     ("_kwh_per_t", "kWh/t"),
     ("_per_s", "1/s"),
+    ("_us", "µs"),
     ("_m_s3", "m/s³"),
     ("_m_s2", "m/s²"),
     ("_m_s", "m/s"),
@@ -401,6 +404,31 @@ class TraceWriter:
             entity = self._entity(f"truth/{error}", run, train)
             index = self._index(np.arange(count), run)
             self._log_scalars(entity, index, values, [label], [colour])
+
+    def timing(self, run: int, table: np.ndarray) -> None:
+        """Log how punctual the nodes were: a row a tick, in µs; NaN where there is nothing.
+
+        A field of several columns has one for each node: the plant, then the controllers. Each
+        field gets a bar chart over powers of two besides.
+        """
+        index = self._index(np.arange(len(table)), run)
+        for field in table.dtype.names or ():
+            values = table[field].reshape(len(table), -1)
+            names = ["plant", "controller"]
+            if values.shape[1] == 1:
+                names = [title_of(field)]
+            elif values.shape[1] > 2:
+                names[1:] = [f"controller {train + 1}" for train in range(values.shape[1] - 1)]
+            colours = [CAR_COLOURS[(1 + column) % len(CAR_COLOURS)] for column in range(len(names))]
+            entity = f"timing/{self._run_name(run)}/{field}"
+            self._log_scalars(entity, index, values, names, colours)
+            histogram = pace.Histogram()
+            histogram.add(values[np.isfinite(values)].astype(np.int64))
+            counts = [count for _from_us, count in histogram.octaves()]
+            if counts:
+                bars = self._rr.BarChart(counts, color=BLUE)  # 0, 1, 2 to 3, 4 to 7 µs …
+                entity = f"timing/{self._run_name(run)}/octaves/{field}"
+                self._stream.log(entity, bars, static=True, strict=True)
 
     def run_summary(self, run: int, row: dict[str, Any]) -> None:
         """Log a run's row of summary.json: its numbers on timeline `run`, bars, and a table."""

@@ -221,6 +221,29 @@ def test_a_hub_that_does_not_answer(node, monkeypatch):
         os.kill(bus.hub_pid, signal.SIGCONT)
 
 
+def test_a_hub_that_hangs_is_killed_with_its_socket_and_one_that_answers_is_not(node, monkeypatch):
+    bus = node()
+    monkeypatch.setattr(hub, "_ANSWER_TIMEOUT_S", 0.5)
+    assert bus.hub_answers()
+    hub.end_hung_hub(bus.channel, bus.hub_pid)
+    assert bus.hub_answers()
+    os.kill(bus.hub_pid, signal.SIGSTOP)
+    assert not bus.hub_answers()
+    hub.end_hung_hub(bus.channel, bus.hub_pid)
+    wait_until(lambda: not runs(bus.hub_pid))
+    assert not socket_path(bus.channel).exists()
+    hub.end_hung_hub(bus.channel, bus.hub_pid)  # there is none any more
+    assert node().hub_pid != bus.hub_pid
+
+
+@pytest.mark.parametrize("wait_s", [0.001, 0.05])
+def test_a_frame_ends_a_wait_however_short(node, wait_s):
+    sender, receiver = node(), node()
+    assert receiver.recv_frames(wait_s) == []
+    sender.send_frames([(1, 2)])
+    wait_until(lambda: receiver.recv_frames(wait_s) == [(1, 2)])
+
+
 # Death of a node
 
 

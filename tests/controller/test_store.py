@@ -76,6 +76,37 @@ def test_every_cut_is_refused(path, calibration):
         refusal(path, calibration)
 
 
+def test_a_write_cut_at_any_byte_leaves_a_whole_generation(path, calibration, cells):
+    """Cut while FILE.new is written; and, on a disk that renames before it writes, in FILE."""
+    store.save(path, calibration, cells + 1, 8)
+    whole = path.read_bytes()
+    store.save(path, calibration, cells + 2, 9)
+    unfinished, previous = (path.with_name(path.name + end) for end in (".new", ".previous"))
+    newest = path.read_bytes()
+    for length in range(len(newest)):
+        path.write_bytes(whole)
+        unfinished.write_bytes(newest[:length])
+        assert store.load(path, calibration).iteration == 8
+        path.write_bytes(newest[:length])
+        refusal(path, calibration)
+        stored = store.load(previous, calibration)
+        assert stored.iteration == 8
+        assert (stored.cells == cells + 1).all()
+
+
+def test_a_save_after_a_kill_is_not_disturbed_by_what_that_left(path, calibration, cells):
+    unfinished = path.with_name(path.name + ".new")
+    unfinished.write_bytes(b"half a mem")
+    store.save(path, calibration, cells, 8)
+    assert store.load(path, calibration).iteration == 8
+    assert not unfinished.exists()
+    unfinished.write_bytes(b"half a mem")
+    store.remove_unfinished(path)
+    assert not unfinished.exists()
+    store.remove_unfinished(path)
+    assert store.load(path, calibration).iteration == 8
+
+
 def test_every_flipped_bit_is_refused(path, calibration):
     whole = path.read_bytes()
     for bit in range(8 * len(whole)):
