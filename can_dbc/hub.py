@@ -58,6 +58,7 @@ _SENT_WORDS = {False: struct.Struct("<Qq"), True: struct.Struct("<Qq56x")}
 _RECEIVED_WORDS = {False: struct.Struct("<8xQq"), True: struct.Struct("<8xQq56x")}
 _MAILBOX = 8 << 32
 _STANDARD_IDS = 0x800
+_PEER = struct.Struct("3i")  # struct ucred
 _FLAGS_SHIFT = 40  # of the flags in the first word
 
 
@@ -301,23 +302,38 @@ def socket_path(channel: str) -> Path:
     return rendezvous.socket_path(SERVER, channel)
 
 
-def end_hung_hub(channel: str, hub_pid: int) -> None:
-    """Kill the hub of a channel, process `hub_pid`, if nodes can connect but get no answer: it
-    would stay for ever, and nobody could join."""
+def end_hung_hub(channel: str) -> None:
+    """Kill the hub of a channel if nodes can connect but get no answer: it would stay for ever, and
+    nobody could join. Delete the socket if there is no hub."""
     path = socket_path(channel)
     try:
         connection, _, _ = _ask(path, {"fd": False, "own": False, "filters": []}, _ANSWER_TIMEOUT_S)
     except TimeoutError:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(hub_pid, signal.SIGKILL)
-        deadline = time.monotonic() + _ANSWER_TIMEOUT_S
-        while path.exists() and time.monotonic() < deadline:  # it takes a moment to die
-            time.sleep(0.01)
-            rendezvous.leave(path)
+        _kill_server(path)
     except OSError:
-        rendezvous.leave(path)  # it was killed, and its socket is left
+        rendezvous.leave(path)
     else:
         connection.close()
+
+
+def _kill_server(path: Path) -> None:
+    """Kill the hub that listens on a socket, where the system says who that is."""
+    if not hasattr(socket, "SO_PEERCRED"):
+        return
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection,
+        contextlib.suppress(OSError),
+    ):
+        connection.connect(os.fspath(path))
+        credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
+        pid, _user, _group = _PEER.unpack(credentials)
+        # Until a hub serves it is the process that started it.
+        if os.fsencode(path) in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
+            os.kill(pid, signal.SIGKILL)
+    deadline = time.monotonic() + _ANSWER_TIMEOUT_S
+    while path.exists() and time.monotonic() < deadline:  # it takes a moment to die
+        time.sleep(0.01)
+        rendezvous.leave(path)
 
 
 def _filter_words(filters: CanFilters | None) -> list[tuple[int, int]]:

@@ -54,6 +54,7 @@ FD_FRAME = struct.Struct("<IBBxx64s")
 STAMP = struct.Struct("<Q")
 FLAGS_OFFSET = 13  # of the flags byte in a stamped frame
 
+BACKLOG = 128  # connections that wait to be taken
 LINGER_S = 1.0  # a run that follows another within this time finds the hub still there
 QUEUE_FRAMES = 100_000  # per node: 2.4 MB, 8 MB with fd
 READ_BYTES = 1 << 16  # four times as much would cost a memory mapping for each read
@@ -122,6 +123,7 @@ def serve_as_daemon(path: str, identity: os.stat_result, serve: Callable[[], Non
 
 def serve(listener: socket.socket) -> None:
     """Pass frames between the nodes that connect to `listener`, until the last one has left."""
+    listener.listen(BACKLOG)  # again: connections now name this process as their peer
     listener.setblocking(False)
     hub = Hub(listener, selectors.DefaultSelector())
     hub.selector.register(listener, selectors.EVENT_READ)

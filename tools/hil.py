@@ -87,11 +87,10 @@ class Bench:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.end()
-        if kind is not None and "recorder" in self.nodes:
-            hubs = self.nodes["recorder"].said.get("ready", {}).get("hubs", ())
-            for bus, hub in zip(self.buses, hubs, strict=False):
-                if hub is not None:
-                    end_hung_hub(bus.partition(":")[2], hub)
+        for bus in self.buses if kind is not None else ():
+            interface, _colon, channel = bus.partition(":")
+            if interface == "hub":
+                end_hung_hub(channel)
 
     def over(self, run: int | None) -> bool:
         """Whether every node has given its account of a run."""

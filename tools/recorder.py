@@ -7,7 +7,7 @@ that a run that is cut short leaves its trace. Internal: `ato-hil run` starts it
 
 It says on stdout, in JSON lines:
 
-    {"event": "ready", "hubs": [4711]}                     it listens; processes of the buses
+    {"event": "ready"}                                     it listens
     {"event": "run", "run": 1, "ticks": …, "frames": …,    a run has ended on every bus; lost frames
      "lost": {…}, "dropped": 0, "foreign": 0,              by message, as the buses counted them,
      "digest": "…", "digests": ["…"],                      frames of other kinds, digest of all runs
@@ -389,7 +389,7 @@ def main() -> int:
         return 1
     e2e.check(0, -1, RUN_CTRL.data_id)  # compiles, or loads what was compiled before
     gc.freeze()  # the garbage collector need not look at all of Rerun again and again
-    tell("ready", hubs=[getattr(bus, "hub_pid", None) for bus, _ in taps])
+    tell("ready")
     status = 0
     try:
         record(taps, commands, stop)

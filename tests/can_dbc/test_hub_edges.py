@@ -225,14 +225,14 @@ def test_a_hub_that_hangs_is_killed_with_its_socket_and_one_that_answers_is_not(
     bus = node()
     monkeypatch.setattr(hub, "_ANSWER_TIMEOUT_S", 0.5)
     assert bus.hub_answers()
-    hub.end_hung_hub(bus.channel, bus.hub_pid)
+    hub.end_hung_hub(bus.channel)
     assert bus.hub_answers()
     os.kill(bus.hub_pid, signal.SIGSTOP)
     assert not bus.hub_answers()
-    hub.end_hung_hub(bus.channel, bus.hub_pid)
+    hub.end_hung_hub(bus.channel)
     wait_until(lambda: not runs(bus.hub_pid))
     assert not socket_path(bus.channel).exists()
-    hub.end_hung_hub(bus.channel, bus.hub_pid)  # there is none any more
+    hub.end_hung_hub(bus.channel)  # there is none any more
     assert node().hub_pid != bus.hub_pid
 
 

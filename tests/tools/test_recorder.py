@@ -367,7 +367,7 @@ def start(runtime_dir: Path, tmp_path: Path) -> Iterator[Start]:
         )
         processes.append(process)
         if wait:
-            assert next_event(process)["event"] == "ready"
+            assert next_event(process) == {"event": "ready"}
         return process
 
     yield begin
