@@ -19,7 +19,7 @@ DEV_READY := .venv/dev.ready
 COMPILE := .venv/bin/python -m uv pip compile pyproject.toml --universal --generate-hashes --group build \
 	--no-header --no-annotate --no-emit-index-url --quiet
 
-.PHONY: help hil test long test-socketcan verify golden pareto lint types lock clean
+.PHONY: help hil test long test-socketcan verify golden pareto figures claims docs lint types lock clean
 
 help: ## list the targets
 	sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 23
@@ -55,6 +55,46 @@ golden: $(RUN_READY) ## write new golden digests (tools/verify/golden.json) and 
 pareto: $(RUN_READY) ## draw docs/pareto.png again: energy against error in paper 5
 	.venv/bin/ato-hil sweep gradient-paper:VI --vary law.L=1,5 --vary law.S=0,0.1,0.25,0.5,1,2,4 --out runs/pareto
 	cp runs/pareto/pareto.png docs/pareto.png
+
+# Where two lines draw the same figure, the later one stays. The traces take a gigabyte.
+figures: $(RUN_READY) ## draw docs/figures again: the papers' figures, from runs of all papers
+	rm -rf runs/figures
+	run() { .venv/bin/ato-hil run "$${@:2}" --mode sil --out "runs/figures/$$1" >/dev/null; echo "$$1"; }
+	draw() { .venv/bin/ato-hil figures "$${@/#/runs/figures/}" --format png --out docs/figures; }
+	run subway subway
+	draw subway
+	for law in cailc pdilc adaptive; do
+		run "disturbed-$$law" subway-disturbed --law "$$law"
+		run "paper-$$law" subway-paper --law "$$law"
+	done
+	draw disturbed-cailc disturbed-pdilc disturbed-adaptive
+	draw paper-cailc paper-pdilc paper-adaptive
+	run th1 crh3-paper
+	run th2 crh3-varying
+	draw th1 th2
+	run poc line-paper
+	run svl line-paper --law mtcc-single
+	run pid line-pid
+	draw poc svl pid
+	run afilc crh3-learning-min --runs 100 --no-trace
+	run afilc-first crh3-learning-min --runs 1
+	run p-ilc crh3-learning-paper --law p-ilc --runs 100 --no-trace
+	run p-ilc-first crh3-learning-paper --law p-ilc --runs 2
+	draw afilc afilc-first p-ilc p-ilc-first
+	cases=(I II III IV V VI VII VIII)
+	for case in "$${cases[@]}"; do run "$$case" "gradient-paper:$$case" --no-trace; done
+	draw "$${cases[@]}"
+	find runs/figures -name trace.rrd -delete
+
+claims: $(RUN_READY) ## measure what the papers claim again, and write it into docs/papers
+	mkdir -p runs/claims
+	for paper in cailc drac mtcc afilc iplc; do
+		.venv/bin/ato-hil claims "$$paper" --json "runs/claims/$$paper.json"
+	done
+	.venv/bin/python -m tools.docs runs/claims/*.json
+
+docs: $(RUN_READY) ## write docs/messages.md and docs/command-line.md again, from DBC and program
+	.venv/bin/python -m tools.docs
 
 lint: $(DEV_READY) ## ruff: lint and format
 	.venv/bin/python -m ruff check .

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from plant_sim.scenario import Scenario, case_names, load, scenario_names
-from tools import environment, report
+from tools import environment, report, session
 from tools.figures.folder import Folder, FolderError, read
 
 DIGEST = "0123456789abcdef0123456789abcdef"
@@ -85,7 +85,7 @@ def page_of(path: Path) -> tuple[Page, str]:
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Page, str]:
-    return page_of(folder(tmp_path_factory.mktemp("report")))
+    return page_of(folder(tmp_path_factory.mktemp("report") / "run"))
 
 
 def test_it_has_everything_that_a_colleague_asks_for(page) -> None:
@@ -131,11 +131,9 @@ def test_its_pictures_are_inside_and_named(page) -> None:
 
 
 def test_the_same_folder_gives_the_same_page(page, tmp_path: Path) -> None:
-    for home in ("here", "there"):
-        (tmp_path / home).mkdir()
-    here, there = (page_of(folder(tmp_path / home / "run"))[1] for home in ("here", "there"))
-    assert here == there
-    assert str(tmp_path) not in here
+    again = page_of(folder(tmp_path / "run"))[1]
+    assert again == page[1]
+    assert str(tmp_path) not in again
 
 
 def test_what_others_put_into_the_summary_is_shown(tmp_path: Path) -> None:
@@ -194,6 +192,22 @@ def test_the_scenario_in_the_page_is_the_one_that_ran(name: str) -> None:
     told = Folder(Path(), {"configuration": configuration}, loaded.scenario)
     again = msgspec.convert(tomllib.loads(report.toml(told)), Scenario)
     assert msgspec.structs.replace(again, base=loaded.scenario.base) == loaded.scenario
+
+
+def test_the_saved_scenario_gives_the_same_digest(short_text, silent, tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text(short_text)
+
+    def run(name: str) -> Folder:
+        path = tmp_path / name
+        options = session.Options(
+            *(str(tmp_path / f"{name}.toml"), None, 1, "sil", "none", 3, path, None), trace=False
+        )
+        session.run(options, silent)
+        return read(path)
+
+    first = run("short")
+    (tmp_path / "again.toml").write_text(report.toml(first), encoding="utf-8")
+    assert run("again").summary["digest"] == first.summary["digest"]
 
 
 def test_a_saved_scenario_loads_as_a_file(tmp_path: Path) -> None:

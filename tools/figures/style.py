@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from PIL import Image
 
 from tools.figures.folder import Folder
 
@@ -66,6 +67,8 @@ SETTINGS: Any = {
 
 DECADE = 8.0  # a span of values that asks for a logarithmic axis
 FEW_LABELS = 1000.0  # one that leaves room for the powers of ten alone
+
+PALETTE = 64  # colours of a PNG
 
 FORMATS = ("png", "svg", "pdf")
 # Nothing that changes from one day or version to the next.
@@ -161,4 +164,13 @@ def bytes_of(figure: Figure, kind: str, dots_per_inch: int = 150) -> bytes:
     target = io.BytesIO()
     with matplotlib.rc_context(SETTINGS):
         figure.savefig(target, format=kind, dpi=dots_per_inch, metadata=METADATA[kind])
+    return _few_colours(target) if kind == "png" else target.getvalue()
+
+
+def _few_colours(picture: io.BytesIO) -> bytes:
+    """A PNG with a palette: a third of the size, and to the eye the same."""
+    with Image.open(picture) as image:
+        few = image.convert("RGB").quantize(PALETTE, Image.Quantize.MEDIANCUT)
+    target = io.BytesIO()
+    few.save(target, "png", optimize=True)
     return target.getvalue()
