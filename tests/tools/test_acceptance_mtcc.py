@@ -37,6 +37,7 @@ from tools.verify.accuracy import differences
 from tools.verify.references import REFERENCES
 
 SEEDS = range(1, 11)
+BOTH_LAWS = [POC, pytest.param(SVL, marks=pytest.mark.long)]  # each law compiles a loop of its own
 
 
 def error_m(base: str, text: str = "", law: str = POC, seed: int = 1) -> float:
@@ -63,6 +64,7 @@ def test_the_embedded_gains_stay_inside_with_any_seed(text: str, bound_m: float)
     assert max(error_m("line", text, seed=seed) for seed in SEEDS) <= bound_m
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("text", "bound_m"), [(NOMINAL, 0.135), (ALL_4, 0.140)])
 def test_the_single_parameter_law_stays_inside(text: str, bound_m: float) -> None:
     assert error_m("line", text, SVL) <= bound_m
@@ -116,6 +118,7 @@ def test_the_separation_outlives_a_fault_with_everything_on(name: str, lag_s: fl
     assert max(row["max_separation_m"] for row in rows) < 600
 
 
+@pytest.mark.long
 def test_the_pid_has_the_range_of_the_reading() -> None:
     pid = run("line-pid")
     assert -pid.least_error_m.min() == pytest.approx(1.56, abs=0.1)
@@ -128,10 +131,14 @@ def test_the_pid_has_the_range_of_the_reading() -> None:
 def test_the_printed_gains_keep_the_barrier() -> None:
     errors = run("line-paper").errors_m
     np.testing.assert_allclose(1e3 * errors, [16.5, 13.3, 14.1, 11.1, 9.1], atol=0.5)
+
+
+@pytest.mark.long
+def test_the_printed_gains_of_the_single_parameter_law_keep_the_barrier() -> None:
     assert error_m("line-paper", law=SVL) == pytest.approx(0.0625, abs=0.005)
 
 
-@pytest.mark.parametrize("law", [POC, SVL])
+@pytest.mark.parametrize("law", BOTH_LAWS)
 def test_the_printed_gains_keep_the_separation(law: str) -> None:
     row = run("line-paper", law=law).row
     assert row["min_separation_m"] > 509.5
@@ -142,7 +149,7 @@ def test_a_tick_of_delay_breaks_the_printed_gains() -> None:
     assert error_m("line-paper", DELAY) > 0.1
 
 
-@pytest.mark.parametrize("law", [POC, SVL])
+@pytest.mark.parametrize("law", BOTH_LAWS)
 def test_a_lag_breaks_the_printed_gains_within_seconds(law: str) -> None:
     assert run("line-paper", LAG, law).outside_at_s < 15
 
@@ -194,5 +201,6 @@ def test_the_default_line_shows_what_it_is_for() -> None:
     assert "timetable re-based" in failure.faults
 
 
+@pytest.mark.long
 def test_the_pid_is_far_from_the_barrier_law() -> None:
     assert error_m("line-pid", law=PID) > 10 * error_m("line-paper")

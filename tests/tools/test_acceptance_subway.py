@@ -391,6 +391,7 @@ def test_a3_pd_type_learning_overspeeds_once(learn):
     assert rows[2]["faults"] == []
 
 
+@pytest.mark.long
 def test_a4_adaptive_control_tracks_worse_and_jitters(learn):
     smooth = learn("subway-paper", law="adaptive", runs=1)
     assert 0.48 <= delta(smooth) <= 0.54
