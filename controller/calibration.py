@@ -372,11 +372,11 @@ def _recall(params: np.ndarray, recall: Recall) -> None:
 
 
 def _along_track(params: np.ndarray, pitch_m: float, profile: np.ndarray) -> None:
-    """Lays the cells of `_memory` along the track, from where the profile starts to where it
-    ends."""
+    """Lays the cells of `_memory` along the track, so that all of the profile lies between
+    cells."""
     pitch = fixed("pitch_m", pitch_m, Q_POSITION)
     params["pitch"] = pitch
-    params["cells"] = (reference.length(profile) >> 25) // pitch + 1
+    params["cells"] = -(-reference.length(profile) // (pitch << 25)) + 1
 
 
 def save(calibration: Calibration, path: Path) -> None:

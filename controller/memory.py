@@ -132,12 +132,12 @@ def recall(params: Any, state: Any, memory: Any, cell: Any) -> None:
 @step
 def gather_along(params: Any, state: Any, memory: Any, cell: Any, position: Any) -> None:
     """`cell.before` at `position`; before the first and beyond the last cell, that cell's."""
-    pitch = max(int64(params.pitch), int64(1))
+    pitch = int64(params.pitch)
     last = int64(params.cells) - 1
     place = clamp(position, int64(0), last * pitch)
-    here = place // pitch
+    here = place // max(pitch, int64(1))
     ahead = min(here + 1, last)
-    delta = ((place - here * pitch) << 30) // pitch  # of the cell ahead, below 1
+    delta = ((place - here * pitch) << 30) // max(pitch, int64(1))  # of the cell ahead, below 1
     live = 1 - int64(state.generation)
     for w in range(WORDS_MAX):
         if w < int64(params.words):

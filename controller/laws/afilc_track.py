@@ -14,7 +14,7 @@ learned there counts at once and stays for the runs that follow. The two rules a
 share what a tick teaches. The memory holds the rules (the delta_l are its doing): the words here
 are the sums over l, such as w = sum w_l delta_l.
 
-256 m are 205 rules on 52.3 km. Gains 0 of all but w leave a memory of w alone, whose bounds then
+256 m are 206 rules on 52.3 km. Gains 0 of all but w leave a memory of w alone, whose bounds then
 have to cover a + b v + c v^2 as well. `feedforward`, `eps` and the bound of 1 - phi^2/kv^2 are
 those of `afilc`.
 

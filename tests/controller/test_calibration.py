@@ -196,7 +196,7 @@ TRACK = {
 }
 
 
-def test_rules_along_the_track_are_as_many_as_pitches_fit_on_it():
+def test_rules_along_the_track_have_all_of_it_between_them():
     """Whatever the grid over time is."""
     settings = MemorySettings(decimation=16, lead_ticks=32, storage="int16")
     profile = np.array([(400, 0), (1000, 25_000), (1001, -25_000)], SEGMENT)
@@ -204,12 +204,12 @@ def test_rules_along_the_track_are_as_many_as_pitches_fit_on_it():
     gains = TRACK | {"pitch_m": end_m / 6.5}
     made = calibrate(law="afilc-track", gains=gains, profile=profile, memory_settings=settings)
     memory = made.params[0]["memory"]
-    assert (memory["cells"], memory["words"], memory["scale"]) == (7, 5, 1)
+    assert (memory["cells"], memory["words"], memory["scale"]) == (8, 5, 1)
     assert memory["pitch"] == round(end_m / 6.5 * 2**15)
     assert made.memory_dtype == "int32"
     alone = gains | {"Gamma": [0.0, 0.0, 0.0], "kappa": 0.0}
     made = calibrate(law="afilc-track", gains=alone, profile=profile)
-    assert initial_memory(made.params[0]["memory"]).nbytes == 2 * 7 * 4
+    assert initial_memory(made.params[0]["memory"]).nbytes == 2 * 8 * 4
     assert calibrate(law="cailc").params[0]["memory"]["pitch"] == 0
 
 

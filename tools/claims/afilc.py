@@ -246,7 +246,7 @@ CLAIMS = [
           lambda: falls_to(stretched(), POSITION)),
     Claim("the same every 128 m", "yes", "", 0, 0.06, True,
           lambda: falls_to(stretched(":fine"), POSITION)),
-    Claim("one number every 256 m, 820 bytes: position falls to", "-", "", 0, 0.162, True,
+    Claim("one number every 256 m, 824 bytes: position falls to", "-", "", 0, 0.162, True,
           lambda: falls_to(stretched(":weights"), POSITION)),
     Claim("one number every 128 m: position falls to", "-", "", 0, 0.086, True,
           lambda: falls_to(stretched(":weights-fine"), POSITION)),

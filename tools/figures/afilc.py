@@ -22,7 +22,7 @@ from tools.figures.style import (
     stated,
 )
 
-LAWS = {"afilc": "AFILC", "p-ilc": "P-type ILC"}
+LAWS = {"afilc": "AFILC", "afilc-track": "AFILC by place", "p-ilc": "P-type ILC"}
 SHOWN = (4, 40, 80)  # runs of Figure 4
 OVERSPEED_KM_H = 2.0  # the paper's constraint, above the desired speed
 N_PER_KG = 1e-3 * GRAVITY_M_S2  # of 1 N/kN
