@@ -1,0 +1,75 @@
+"""The guard in whole runs (SIL): silent while nothing is wrong, and what a scenario asks of it."""
+
+import numpy as np
+import pytest
+
+from can_dbc.codec import ATO_STATUS, FORCE_CMD
+from controller.interface import GUARD_NORMAL, HOLD
+from plant_sim.scenario import Loaded, load, members
+from tools import setup, sil
+from tools.frames import held
+
+pytestmark = pytest.mark.long
+
+
+def first_run(loaded: Loaded, law: str) -> list[sil.RunResult]:
+    """Run 1, of each train."""
+    nodes = setup.controllers_for(members(loaded), law)
+    (results,) = sil.run_line(loaded, nodes, runs=range(1, 2), seed=1)
+    return results
+
+
+@pytest.mark.parametrize(
+    "scenario", ["subway-paper", "subway", "crh3", "crh3-learning", "gradient", "line"]
+)
+def test_in_a_normal_run_the_guard_does_nothing(scenario):
+    loaded = load(scenario)
+    for result in first_run(loaded, loaded.scenario.law):
+        assert result.faults == []
+        guard = held(result.frames, loaded.ticks, ATO_STATUS, "Guard")
+        assert set(guard) == {GUARD_NORMAL}
+
+
+COMFORT = """
+base = "subway"
+
+[control.guard]
+jerk_max_m_s3 = 1.0
+traction_max_m_s2 = 1.1
+brake_max_m_s2 = 1.05
+hold_brake_m_s2 = 0.3
+"""
+
+
+@pytest.fixture(scope="module")
+def comfortable(tmp_path_factory):
+    """The scenario, and its first run with cailc."""
+    path = tmp_path_factory.mktemp("guard") / "comfort.toml"
+    path.write_text(COMFORT)
+    loaded = load(str(path))
+    return loaded, first_run(loaded, "cailc")[0]
+
+
+def test_the_command_keeps_to_the_comfort_that_a_scenario_states(comfortable):
+    loaded, result = comfortable
+    mass_kg = loaded.scenario.train.mass_kg
+    command = held(result.frames, loaded.ticks, FORCE_CMD, "Force") / mass_kg
+    moves = held(result.frames, loaded.ticks, FORCE_CMD, "Mode") != HOLD
+    lsb = 1 / 16 / mass_kg
+    assert command.max() <= 1.1 + lsb
+    assert command[moves].min() >= -1.05 - lsb
+    steps = np.abs(np.diff(command))[moves[1:] & moves[:-1]]
+    assert steps.max() <= 1.0 * 0.01 + 2 * lsb
+    assert steps.max() > 0.0099  # the limit is reached
+
+
+def test_the_train_is_held_where_the_timetable_stands(comfortable):
+    loaded, result = comfortable
+    holds = held(result.frames, loaded.ticks, FORCE_CMD, "Mode") == HOLD
+    speed = loaded.profile.speed_m_s
+    assert holds[0]
+    assert holds[-1]
+    assert not holds[speed > 0].any()
+    end = result.truth["position_m"][holds & (np.arange(loaded.ticks) > loaded.ticks // 2)]
+    assert np.ptp(end) < 0.01
+    assert abs(end[-1] - loaded.profile.position_m[-1]) < 0.3
