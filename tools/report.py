@@ -111,10 +111,10 @@ def _runs(rows: list[dict[str, Any]]) -> str:
 
 def _plain(row: dict[str, Any]) -> dict[str, Any]:
     """What fits a cell: numbers, texts and the names of faults."""
+    number = {key: row[key] for key in ("run", "train") if key in row}
+    faults = {"faults": ", ".join(map(str, row.get("faults", []))) or "none"}
     cells = {key: value for key, value in row.items() if not isinstance(value, dict | list)}
-    if "faults" in row:
-        cells["faults"] = ", ".join(map(str, row["faults"])) or "none"
-    return cells
+    return {**number, **faults, **cells}
 
 
 def _others(rows: list[dict[str, Any]], summary: dict[str, Any]) -> list[str]:

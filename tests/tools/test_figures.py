@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import matplotlib
@@ -16,7 +17,7 @@ from plant_sim.plant import TRUTH
 from plant_sim.scenario import load
 from tools import environment, session
 from tools.cli import app
-from tools.figures import draw, style
+from tools.figures import afilc, draw, style
 from tools.figures.folder import Folder, FolderError, Missing, read
 from tools.frames import FRAME, decode, estimate
 from tools.trace import TraceWriter
@@ -81,13 +82,18 @@ class Recorded:
             self.write_trace(random)
 
     def write_trace(self, random: np.random.Generator) -> None:
-        line = self.loaded.scenario.line
+        line, profile = self.loaded.scenario.line, self.loaded.profile
+        reference = SimpleNamespace(
+            position_m=profile.position_m[:TICKS],
+            speed_m_s=profile.speed_m_s[:TICKS],
+            acceleration_m_s2=profile.acceleration_m_s2[:TICKS],
+        )
         writer = TraceWriter(
             self.path / "trace.rrd",
             title="random",
             period_s=self.loaded.scenario.period_s,
             cars=6,
-            reference=self.loaded.profile,
+            reference=reference,
             estimates=ESTIMATES,
             last_run=len(self.rows),
             trains=self.loaded.trains,
@@ -260,6 +266,23 @@ def test_learning_over_runs_takes_the_longest_session_of_a_law(of_paper) -> None
     folder = drawn.folders[2]
     error = folder.truth[2, 0]["speed_m_s"] - folder.loaded.profile.speed_m_s[:TICKS]
     np.testing.assert_allclose(above, 3.6 * error, rtol=1e-12)
+
+
+def test_the_limit_is_above_the_desired_speed_of_the_run(of_paper) -> None:
+    drawn = of_paper("afilc")
+    wanted = drawn.folders[1].loaded.profile.speed_m_s[:TICKS]
+    limit = drawn.lines(8)["desired + 2 km/h"][1]
+    np.testing.assert_allclose(limit, 3.6 * wanted + 2.0, rtol=1e-12)
+
+
+def test_a_stretched_run_meets_the_whole_track_and_a_cut_one_its_beginning(tmp_path: Path) -> None:
+    planned = load("crh3-learning-min").profile.position_m
+    Recorded(tmp_path / "cut", "crh3-learning-min", "afilc", 1, False)
+    cut = afilc.desired_position(read(tmp_path / "cut"), 1000)
+    np.testing.assert_array_equal(cut, planned[:1000])
+    Recorded(tmp_path / "stretched", "crh3-learning-stretched", "afilc-track", 1, False)
+    stretched = afilc.desired_position(read(tmp_path / "stretched"), len(planned) // 2 + 1)
+    np.testing.assert_allclose(stretched, planned[::2], atol=0.5)
 
 
 def test_cases_are_told_apart_by_what_is_varied(of_paper) -> None:

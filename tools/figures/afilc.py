@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from plant_sim.trains.lumped import GRAVITY_M_S2
@@ -23,6 +24,7 @@ from tools.figures.style import (
 )
 
 LAWS = {"afilc": "AFILC", "afilc-track": "AFILC by place", "p-ilc": "P-type ILC"}
+OURS, BASELINE = ("afilc", "afilc-track"), ("p-ilc",)
 SHOWN = (4, 40, 80)  # runs of Figure 4
 OVERSPEED_KM_H = 2.0  # the paper's constraint, above the desired speed
 N_PER_KG = 1e-3 * GRAVITY_M_S2  # of 1 N/kN
@@ -54,15 +56,26 @@ def resistance_in_runs(folders: list[Folder]) -> Figure:
         raise Missing(f"{folder.label} has none of the runs {', '.join(map(str, SHOWN))}")
     figure, axes = panels(len(runs), height_in=0.6 + 1.0 * len(runs))
     for index, (run, each) in enumerate(zip(runs, axes, strict=True)):
-        place_m = folder.profile.position_m[: of_run[run]["ticks"]]
+        place_m = desired_position(folder, of_run[run]["ticks"])
         values = N_PER_KG * plots.resistance(folder.scenario, place_m)
-        each.plot(folder.reference_time_s[: len(values)], values, label=f"run {run}", **look(index))
-        each.axvline(folder.reference_time_s[len(values) - 1], **LIMIT)
-        length_s = (len(values) - 1) * folder.scenario.period_s
+        time_s = np.arange(len(values)) * folder.scenario.period_s
+        length_s = time_s[-1]
+        each.plot(time_s, values, label=f"run {run}", **look(index))
+        each.axvline(length_s, **LIMIT)
         each.set_title(f"run {run}, {length_s:.0f} s", fontsize=7, loc="left", pad=2)
     axes[len(axes) // 2].set_ylabel("additional resistance [N/kg]")
     axes[-1].set_xlabel(plots.SECONDS)
     return figure
+
+
+def desired_position(folder: Folder, ticks: int) -> np.ndarray:
+    """Of a run of so many ticks: the planned one, cut, or gone through in that time."""
+    planned = folder.profile.position_m
+    lengths = folder.scenario.run_length
+    if lengths is None or lengths.reading == "cut":
+        return planned[:ticks]
+    at = np.linspace(0.0, len(planned) - 1.0, ticks)
+    return np.interp(at, np.arange(len(planned)), planned)
 
 
 def errors_by_run(key: str, factor: float, text: str) -> Callable[[list[Folder]], Figure]:
@@ -79,20 +92,21 @@ def errors_by_run(key: str, factor: float, text: str) -> Callable[[list[Folder]]
     return draw
 
 
-def first_runs(law: str, count: int) -> Callable[[list[Folder]], Figure]:
+def first_runs(laws: tuple[str, ...], count: int) -> Callable[[list[Folder]], Figure]:
     """Speed in the first `count` runs of a law, and how far it is above the desired one."""
 
     def draw(folders: list[Folder]) -> Figure:
-        folder = _with_trace(folders, law)
+        folder = _with_trace(folders, laws)
         figure, (speed, above) = panels(2)
-        limit_km_h = plots.KM_H * folder.profile.speed_m_s + OVERSPEED_KM_H
-        speed.plot(folder.reference_time_s, limit_km_h, label="desired + 2 km/h", **LIMIT)
         above.axhline(OVERSPEED_KM_H, **LIMIT)
         for index, run in enumerate(folder.learning_runs()[:count]):
             drawn = folder.series("truth/speed_m_s", run)
-            label = f"{LAWS[law]}, run {run}"
-            speed.plot(drawn.time_s, plots.KM_H * drawn.line, label=label, **look(index))
             off = folder.series("truth/speed_error_m_s", run)
+            if index == 0:
+                limit_km_h = plots.KM_H * (drawn.line - off.line) + OVERSPEED_KM_H
+                speed.plot(drawn.time_s, limit_km_h, label="desired + 2 km/h", **LIMIT)
+            label = f"{LAWS[folder.law]}, run {run}"
+            speed.plot(drawn.time_s, plots.KM_H * drawn.line, label=label, **look(index))
             above.plot(off.time_s, plots.KM_H * off.line, label=label, **look(index))
         speed.set_ylabel("speed [km/h]")
         above.set_ylabel("above desired\n[km/h]")
@@ -113,11 +127,11 @@ def _longest(folders: list[Folder]) -> list[Folder]:
     return list(found.values())
 
 
-def _with_trace(folders: list[Folder], law: str) -> Folder:
-    """The first folder of a law that has a trace."""
-    of_law = [folder for folder in folders if folder.law == law]
+def _with_trace(folders: list[Folder], laws: tuple[str, ...]) -> Folder:
+    """The first folder of one of these laws that has a trace."""
+    of_law = [folder for folder in folders if folder.law in laws]
     if not of_law:
-        raise Missing(f"no folder is of law {law}")
+        raise Missing(f"no folder is of law {' or '.join(laws)}")
     for folder in of_law:
         if folder.trace_file.exists():
             return folder
@@ -135,7 +149,7 @@ FIGURES = (
             errors_by_run("rms_position_error_m", 1.0, "rms position error [m]")),
     Drawing(7, "speed-error", "Rms speed error by run",
             errors_by_run("rms_speed_error_m_s", 1.0, "rms speed error [m/s]")),
-    Drawing(8, "speed-first-run", "Speed in the first run", first_runs("afilc", 1)),
+    Drawing(8, "speed-first-run", "Speed in the first run", first_runs(OURS, 1)),
     Drawing(9, "speed-first-run-p-type", "Speed in the first runs of the P-type baseline",
-            first_runs("p-ilc", 2)),
+            first_runs(BASELINE, 2)),
 )  # fmt: skip

@@ -19,7 +19,7 @@ PAPERS: dict[str, tuple[tuple[Drawing, ...], tuple[str, ...]]] = {
     "cailc": (cailc.FIGURES, ("cailc", "ailc", "pdilc", "adaptive", "pid")),
     "drac": (drac.FIGURES, ("drac", "drac-robust", "drac-exact", "pid-feedforward")),
     "mtcc": (mtcc.FIGURES, ("mtcc", "mtcc-single", "mtcc-pid")),
-    "afilc": (afilc.FIGURES, ("afilc",)),
+    "afilc": (afilc.FIGURES, ("afilc", "afilc-track")),
     "iplc": (iplc.FIGURES, ("iplc", "norm-optimal")),
 }
 

@@ -32,8 +32,8 @@ LIMIT: dict[str, Any] = {
 }
 STATED: dict[str, Any] = {
     "color": "black",
-    "linewidth": 0.8,
-    "linestyle": (0, (1, 1)),
+    "linewidth": 1.1,
+    "linestyle": (0, (1.2, 2)),
     "zorder": 1.6,
 }
 
