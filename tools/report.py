@@ -13,6 +13,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from tools import realtime
 from tools.figures import draw, style
 from tools.figures.folder import Folder, FolderError, read
 from tools.files import write_text
@@ -20,7 +21,9 @@ from tools.trace import title_of
 
 SESSION = ("scenario", "law", "mode", "pace", "bus", "external", "seed", "ended_early")
 DIGESTS = ("digest", "digests", "scenario_digest")
-KNOWN = (*SESSION, *DIGESTS, "schema", "runs", "versions", "machine", "configuration", "controller")
+ELSEWHERE = ("schema", "digest_repeats", "runs", "timing", "faults_file")
+SOURCES = ("versions", "machine", "configuration", "controller")
+KNOWN = (*SESSION, *DIGESTS, *ELSEWHERE, *SOURCES)
 PICTURE_DPI = 130
 
 CSS = """
@@ -66,6 +69,7 @@ def html(folder: Folder, figures: Sequence[draw.Drawn]) -> str:
         _section("Session", _pairs({key: summary[key] for key in SESSION if key in summary})),
         _section("Digests", _pairs({key: summary[key] for key in DIGESTS if key in summary})),
         _section("Runs", _runs(folder.rows)),
+        _section("Timing", _timing(summary.get("timing"))),
         *_others(folder.rows, summary),
         _section("Figures", _figures(figures)),
         _section("Again", _again(folder)),
@@ -109,10 +113,21 @@ def _runs(rows: list[dict[str, Any]]) -> str:
     return "\n".join(parts)
 
 
+def _timing(timing: dict[str, Any] | None) -> str:
+    """How punctual a run in real time was."""
+    if timing is None:
+        return ""
+    rows = [
+        dict(zip(("real time, µs", "p50", "p99", "p99.9", "max"), row, strict=True))
+        for row in realtime.rows(timing)
+    ]
+    return f"{_table(rows)}\n<p>{escape(realtime.verdict(timing))}</p>"
+
+
 def _plain(row: dict[str, Any]) -> dict[str, Any]:
     """What fits a cell: numbers, texts and the names of faults."""
-    number = {key: row[key] for key in ("run", "train") if key in row}
-    faults = {"faults": ", ".join(map(str, row.get("faults", []))) or "none"}
+    number: dict[str, Any] = {key: row[key] for key in ("run", "train") if key in row}
+    faults: dict[str, Any] = {"faults": ", ".join(map(str, row.get("faults", []))) or "none"}
     cells = {key: value for key, value in row.items() if not isinstance(value, dict | list)}
     return {**number, **faults, **cells}
 
@@ -215,13 +230,25 @@ def _figures(figures: Sequence[draw.Drawn]) -> str:
 def _again(folder: Folder) -> str:
     """How to get the same digest."""
     summary = folder.summary
+    faults = summary.get("faults_file")
     command = f"ato-hil run SCENARIO.toml --law {folder.law} --mode {summary.get('mode', 'sil')}"
-    command += f" --runs {len(folder.learning_runs())}" if folder.rows else ""
+    command += " --pace realtime" if summary.get("pace") == "realtime" else ""
+    command += f" --runs {sum(row['run'] >= 1 for row in folder.rows)}" if folder.rows else ""
     command += f" --seed {summary.get('seed', 1)}"
+    command += " --faults FAULTS.toml" if faults else ""
+    outcome = "gives the same digest."
+    if not summary.get("digest_repeats", True):
+        outcome = "runs it again; in real time the digest is another one each time."
+    if folder.rows and folder.rows[0]["run"] > 1:
+        learned = folder.rows[0]["run"] - 1
+        outcome += f" It takes the learning memory after run {learned}, too (--memory)."
+    files = {"SCENARIO.toml": toml(folder), **({"FAULTS.toml": faults} if faults else {})}
     return (
-        "<p>The whole scenario, whatever it inherited. Saved as SCENARIO.toml,</p>"
-        f"<pre>{escape(command)}</pre><p>gives the same digest.</p>"
-        f"<details><summary>SCENARIO.toml</summary><pre>{escape(toml(folder))}</pre></details>"
+        "<p>The whole scenario, whatever it inherited, is below. Saved as SCENARIO.toml,</p>"
+        f"<pre>{escape(command)}</pre><p>{outcome}</p>"
+    ) + "".join(
+        f"<details><summary>{name}</summary><pre>{escape(text)}</pre></details>"
+        for name, text in files.items()
     )
 
 

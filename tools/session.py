@@ -141,7 +141,8 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         "machine": environment.machine(),
         "configuration": environment.configuration(loaded),
     }
-    if plan is not None:
+    if options.faults is not None:
+        session.summary["faults_file"] = options.faults.read_text(encoding="utf-8")
         session.summary["faults_injected"] = {}
     try:
         if options.mode == "hil":

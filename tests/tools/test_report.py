@@ -7,12 +7,15 @@ import json
 import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
+from can_dbc.pace import TIMING
 from plant_sim.scenario import Scenario, case_names, load, scenario_names
-from tools import environment, report, session
+from tools import environment, realtime, report, session
 from tools.figures.folder import Folder, FolderError, read
 
 DIGEST = "0123456789abcdef0123456789abcdef"
@@ -147,18 +150,46 @@ def test_what_others_put_into_the_summary_is_shown(tmp_path: Path) -> None:
         {"run": 1, "faults": ["lost frame"], "atp": {"warnings": 2, "service_brakes": 1}},
         {"run": 2, "faults": [], "atp": {"warnings": 0, "service_brakes": 0}},
     ]
-    timing = {"latency_us": {"p50": 81.25, "p99": 165.5}, "late": 3}
     injected = [{"kind": "drop", "message": "TRAIN_SPEED"}, {"kind": "delay", "message": "x"}]
     parsed, _text = text_of(
-        folder(tmp_path, runs=rows, timing=timing, injected_faults=injected, ended_early=HOSTILE)
+        folder(tmp_path, runs=rows, injected_faults=injected, ended_early=HOSTILE)
     )
     sections = parsed.sections
     assert "lost frame" in sections["Runs"]
     assert "atp.warnings" not in sections["Runs"]
     assert "Service brakes" in sections["Atp by run"]
-    assert "165.5" in sections["Timing"]
     assert "TRAIN_SPEED" in sections["Injected faults"]
     assert HOSTILE in sections["Session"]
+
+
+def test_a_run_in_real_time_shows_its_timing_and_promises_no_digest(tmp_path: Path) -> None:
+    account = realtime.Account(period_us=10_000, spin_us=0)
+    measured = np.zeros(100, TIMING)
+    measured["lateness_ns"] = 123_000
+    measured["latency_ns"] = 345_000
+    account.add({"plant": measured, "controller": measured})
+    timing = account.summary()
+    parsed, _text = text_of(
+        folder(tmp_path, mode="hil", pace="realtime", digest_repeats=False, timing=timing)
+    )
+    assert realtime.verdict(timing) in parsed.sections["Timing"]
+    assert "plant: measurement sent to command received" in parsed.sections["Timing"]
+    assert str(timing["nodes"]["plant"][realtime.LATENCY]["max"]) in parsed.sections["Timing"]
+    again = parsed.sections["Again"]
+    assert "--mode hil --pace realtime --runs 2 --seed 7" in again
+    assert "another one each time" in again
+    assert "the same digest" not in again
+
+
+def test_faults_and_what_was_learned_before_are_part_of_it(tmp_path: Path) -> None:
+    plan = '[[bus]]\nkind = "drop"\nprobability = 0.01\n'
+    rows: list[dict[str, object]] = [{"run": run, "faults": []} for run in (5, 6)]
+    changes: dict[str, Any] = {"faults_file": plan, "faults_injected": {"drop": 41}, "runs": rows}
+    parsed, _text = text_of(folder(tmp_path, **changes))
+    assert "41" in parsed.sections["Faults injected"]
+    assert "--faults FAULTS.toml" in parsed.sections["Again"]
+    assert plan in parsed.sections["Again"]
+    assert "the learning memory after run 4" in parsed.sections["Again"]
 
 
 def test_nothing_in_a_folder_becomes_markup(tmp_path: Path) -> None:
