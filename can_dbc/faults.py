@@ -27,8 +27,8 @@ from __future__ import annotations
 
 import struct
 import tomllib
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Collection, Sequence
+from functools import cache, partial
 from hashlib import blake2b
 from math import ceil
 from pathlib import Path
@@ -41,8 +41,10 @@ from can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGES, database, word_of
 
 CONTROLLER, PLANT = "controller", "plant"
 RECEIVERS = (PLANT, CONTROLLER)
+SIGNALS = ("SIGKILL", "SIGSTOP")
 TABLES = ("bus", "process", "sensor", "actuator")
 PLAN_FILE = "faults.msgpack"
+SOURCE_FILE = "faults.toml"
 WIRE_FRAMES = 37  # of 135 bits that 500 kbit/s carry in 10 ms
 
 Frame = tuple[int, int]  # identifier and payload, as can_dbc.bus moves them
@@ -202,6 +204,29 @@ class Plan(msgspec.Struct, frozen=True):
     bus: tuple[AnyBusFault, ...]
 
 
+class ProcessEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A signal to the process of a node, once."""
+
+    node: str  # plant, recorder, controller; of a line controller-1, controller-2, …
+    signal: str
+    at_s: Seconds  # of the run
+    run: int = 1
+
+    def __post_init__(self) -> None:
+        if self.signal not in SIGNALS:
+            raise ValueError(f"signal is {self.signal!r}, expected {' or '.join(SIGNALS)}")
+
+
+class ProcessFault(NamedTuple):
+    """The same with its time in ticks."""
+
+    run: int
+    tick: int
+    node: str
+    signal: str
+    number: int  # place in the file, from 1
+
+
 class Event(msgspec.Struct, frozen=True, array_like=True):
     """A fault as it was injected."""
 
@@ -215,9 +240,33 @@ class Event(msgspec.Struct, frozen=True, array_like=True):
     rule: int  # place in the file, from 1
 
 
+class Planned(NamedTuple):
+    """A fault inside a node."""
+
+    runs: tuple[int, ...]  # none: all
+    tick: int  # in which it begins
+    message: str  # what fails
+    kind: str
+    number: int  # place in the file, from 1
+
+
 def load(path: Path, seed: int, period_s: float) -> Plan:
     """The faults of the bus in a file. Raises FaultError with one line."""
     return Plan(seed, period_s, tuple(table(path, "bus", AnyBusFault)))
+
+
+def load_signals(path: Path, nodes: Collection[str], period_s: float) -> list[ProcessFault]:
+    """The signals to processes in a file, of a session with these nodes. Raises FaultError."""
+    signals = []
+    for number, each in enumerate(table(path, "process", ProcessEntry), start=1):
+        if each.node not in nodes:
+            known = ", ".join(nodes)
+            raise FaultError(
+                f"{path}: key process[{number - 1}]: node is {each.node!r}, expected one of {known}"
+            )
+        tick = ceil(round(each.at_s / period_s, 6))
+        signals.append(ProcessFault(each.run, tick, each.node, each.signal, number))
+    return signals
 
 
 def table(path: Path, name: str, kind: Any) -> list[Any]:
@@ -237,29 +286,33 @@ def table(path: Path, name: str, kind: Any) -> list[Any]:
     except msgspec.ValidationError as error:
         text, _, place = str(error).partition(" - at `$")
         if place.endswith(".kind`"):
-            text += f", expected one of {', '.join(_kinds())}"
+            text += f", expected one of {', '.join(_kinds(kind))}"
         raise FaultError(f"{path}: key {name}{place.rstrip('`')}: {text}") from None
     return entries
 
 
-def save(plan: Plan, folder: Path) -> None:
-    """The plan where `receiver` looks for it."""
+def save(plan: Plan, file: Path, folder: Path) -> None:
+    """The plan where `receiver` looks for it, and the file that it is from."""
     (folder / PLAN_FILE).write_bytes(msgspec.msgpack.encode(plan))
+    (folder / SOURCE_FILE).write_bytes(file.read_bytes())
 
 
-def receiver(folder: Path | None, node: str, train: int) -> Receiver | None:
+def receiver(
+    folder: Path | None, node: str, train: int, planned: Sequence[Planned] = ()
+) -> Receiver | None:
     """The faults of a node that is a process, None without a folder; the plan is in the folder, and
     there its log goes, line by line, so that it is whole whenever the process ends."""
     if folder is None:
         return None
     plan = msgspec.msgpack.decode((folder / PLAN_FILE).read_bytes(), type=Plan)
-    file = folder / f"{node}_{train}.log"
+    return Receiver(plan, node, train, partial(append, folder, f"{node}_{train}"), planned)
 
-    def log(event: Event) -> None:
-        with open(file, "ab", buffering=0) as log_file:
-            log_file.write(msgspec.json.encode(event) + b"\n")
 
-    return Receiver(plan, node, train, log)
+def append(folder: Path, name: str, *events: Event) -> None:
+    """Adds to one of the logs in a folder; each has one writer."""
+    lines = b"".join(msgspec.json.encode(event) + b"\n" for event in events)
+    with open(folder / f"{name}.log", "ab", buffering=0) as log:
+        log.write(lines)
 
 
 def injected(folder: Path) -> list[Event]:
@@ -275,8 +328,8 @@ def in_order(events: list[Event]) -> list[Event]:
     return sorted(events, key=lambda event: (event.run, event.tick, event.train, event.node))
 
 
-def _kinds() -> list[str]:
-    return [str(each.__struct_config__.tag) for each in get_args(AnyBusFault)]
+def _kinds(union: Any) -> list[str]:
+    return [str(each.__struct_config__.tag) for each in get_args(union)]
 
 
 @cache
@@ -337,15 +390,17 @@ class Receiver:
         node: str,
         train: int = 0,
         log: Callable[[Event], None] | None = None,
+        planned: Sequence[Planned] = (),
     ) -> None:
         """No run has begun.
 
         :param node: PLANT or CONTROLLER.
         :param train: of a line, 0 leads.
         :param log: hears of each fault as it is injected.
+        :param planned: what else goes wrong in this node, for the log.
         """
         self.node, self.train = node, train
-        self._log = log
+        self._log, self._planned = log, planned
         self._key = str(plan.seed).encode()[:64]
         self._all = [
             _Active(rule, number, *ticks_of(rule, plan.period_s), _touched(rule))
@@ -449,6 +504,10 @@ class Receiver:
         for each in self._rules:
             if isinstance(each.rule, Babble) and each.first <= self._tick < each.end:
                 late = [*late, *self._babbled(each)]
+        for fails in self._planned:
+            if fails.tick == self._tick and (not fails.runs or self._run in fails.runs):
+                where = (self._run, self._tick, self.train + 1, self.node)
+                self._tell(Event(*where, fails.message, fails.kind, 0, fails.number))
         self._room.clear()
         self._tick += 1
         return late
@@ -476,10 +535,13 @@ class Receiver:
         return blake2b(which, key=self._key).digest()
 
     def _note(self, can_id: int, n: int, each: _Active) -> None:
+        kind = type(each.rule).__struct_config__.tag
+        where = (self._run, self._tick, self.train + 1, self.node)
+        self._tell(Event(*where, _name(can_id), str(kind), n, each.number))
+
+    def _tell(self, event: Event) -> None:
         if self._log is not None:
-            kind = type(each.rule).__struct_config__.tag
-            where = (self._run, self._tick, self.train + 1, self.node)
-            self._log(Event(*where, _name(can_id), str(kind), n, each.number))
+            self._log(event)
 
 
 def _touched(rule: Any) -> frozenset[int]:

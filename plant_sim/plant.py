@@ -31,7 +31,7 @@ from can_dbc.codec import (
     saturate,
 )
 from can_dbc.step import int64, step
-from plant_sim import actuator, atp, brakes, radio
+from plant_sim import actuator, atp, brakes, failures, radio
 from plant_sim.mail import received
 
 IDLE, ARMED, RUNNING, ENDED = 0, 1, 2, 3
@@ -133,6 +133,7 @@ def params_dtype(train_params: np.dtype) -> np.dtype:
         [
             ("node", NODE_PARAMS),
             ("radio", radio.PARAMS),
+            ("failures", failures.PARAMS),
             ("actuator", actuator.PARAMS),
             ("atp", atp.PARAMS),
             ("brakes", brakes.PARAMS),
@@ -148,6 +149,7 @@ def state_dtype(train_state: np.dtype) -> np.dtype:
         [
             ("node", NODE_STATE),
             ("radio", radio.STATE),
+            ("failures", failures.STATE),
             ("actuator", actuator.STATE),
             ("atp", atp.STATE),
             ("brakes", brakes.STATE),
@@ -360,6 +362,7 @@ def build(model: Any) -> tuple[Any, Any, Any]:
     def begin_train(params: Any, state: Any) -> None:
         begin_node(state.node)
         radio.reset(state.radio)
+        failures.reset(state.failures)
         actuator.reset(state.actuator)
         actuator.preset(state.actuator, int64(0), params.node.holding_force_n)
         atp.reset(state.atp)
@@ -382,6 +385,9 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         )
         speed = train.speed_m_s + rear * (train.rear_speed_m_s - train.speed_m_s)
         speed += setting.speed_noise_m_s * chance.speed_noise
+        speed, position = failures.measured(
+            params.failures, state.failures, node, speed, position, chance.speed_noise
+        )
         position = quantised(position, setting.position_step_m)
         speed = quantised(speed, setting.speed_step_m_s)
         e2e.send(
@@ -417,7 +423,9 @@ def build(model: Any) -> tuple[Any, Any, Any]:
         read_commands(params.node, node, rx)
         radio.read(node, state.radio, rx)
         fail(params.node, node, train)
+        failures.weaken(params.failures, state.failures, node)
         command_train(params, state)
+        failures.restore(state.failures, node)
         actuator.shift(state.actuator)
         order_brakes(params, state)
         brakes.act(params.brakes, state.brakes, state.actuator, train.speed_m_s)

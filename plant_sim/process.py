@@ -16,6 +16,7 @@ import gc
 import queue
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +31,7 @@ from can_dbc.child import Stop, follow_parent, tell
 from can_dbc.codec import ATO_STATUS, FORCE_CMD, MESSAGES, get
 from can_dbc.faults import PLANT, receiver
 from can_dbc.inbox import Inbox, intact
-from plant_sim import plant, world
+from plant_sim import failures, plant, world
 from plant_sim.scenario import ScenarioError, load
 
 FRAME_IDS = [message.frame_id for message in MESSAGES]
@@ -70,10 +71,17 @@ class Port:
     inbox: Inbox
 
 
-def port_of(here: world.World, train: int, bus: can.BusABC, faults: Path | None) -> Port:
+def port_of(
+    here: world.World,
+    train: int,
+    bus: can.BusABC,
+    faults: Path | None,
+    fails: Sequence[failures.AnyFailure],
+) -> Port:
     """The port of a train; `faults` is the folder of `can_dbc.faults.receiver`."""
     counters = here.state["node"]["received"][train]
-    return Port(bus, Inbox(here.rx[train], counters, receiver(faults, PLANT, train)))
+    planned = failures.planned(fails, train, here.members[train].scenario.period_s)
+    return Port(bus, Inbox(here.rx[train], counters, receiver(faults, PLANT, train, planned)))
 
 
 def collect(port: Port, timeout_s: float) -> list[tuple[int, int]]:
@@ -367,10 +375,13 @@ def main() -> int:
     follow_parent(commands.put)
     opened = ExitStack()
     try:
-        here = world.build(load(arguments.scenario), arguments.seed)
+        fails = failures.of_folder(arguments.faults)
+        here = world.build(load(arguments.scenario), arguments.seed, fails)
         warm_up(here)
         buses = [opened.enter_context(open_bus(name)) for name in arguments.bus]
-        ports = [port_of(here, train, bus, arguments.faults) for train, bus in enumerate(buses)]
+        ports = [
+            port_of(here, train, bus, arguments.faults, fails) for train, bus in enumerate(buses)
+        ]
     except (ScenarioError, BusError) as error:
         opened.close()
         tell("error", message=str(error))

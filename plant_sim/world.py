@@ -6,6 +6,7 @@ run (MIL).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from can_dbc.codec import MAILBOX, MESSAGE_COUNT, NEIGHBOUR_AHEAD_POSITION
 from can_dbc.step import INTERPRETED, step
-from plant_sim import actuator, atp, brakes, plant, track
+from plant_sim import actuator, atp, brakes, failures, plant, track
 from plant_sim.line import Fault
 from plant_sim.profile import RATE_ONE, rate_of, stretched_ticks
 from plant_sim.scenario import MODELS, Loaded, RunLength, Scenario, at_rate, members
@@ -43,6 +44,7 @@ class World:
     track: Any  # [n] of track.SECTION
     rx: Any  # [trains, MESSAGE_COUNT] mailboxes
     tx: Any
+    noisy: bool  # random numbers are drawn for a sensor whatever the scenario says
 
     def ticks(self, run: int) -> int:
         """Control periods of a run."""
@@ -62,8 +64,8 @@ def rows(array: np.ndarray) -> Any:
     return array.view(np.recarray) if INTERPRETED else array
 
 
-def build(loaded: Loaded, seed: int) -> World:
-    """The plant of a scenario, with all its trains."""
+def build(loaded: Loaded, seed: int, fails: Sequence[failures.AnyFailure] = ()) -> World:
+    """The plant of a scenario, with all its trains, and with what fails in it."""
     scenario = loaded.scenario
     model = MODELS[type(scenario.train)]
     trains = members(loaded)
@@ -71,6 +73,8 @@ def build(loaded: Loaded, seed: int) -> World:
     params = np.zeros(len(trains), plant.params_dtype(model.PARAMS))
     for train in trains:
         params[train.train] = _params(train, model)[0]
+        own = failures.calibrate(fails, train.train, scenario.period_s)
+        params["failures"][train.train] = own[0]
     boxes = (len(trains), MESSAGE_COUNT)
     return World(
         members=trains,
@@ -84,6 +88,7 @@ def build(loaded: Loaded, seed: int) -> World:
         track=rows(track.sections(scenario.track)),
         rx=rows(np.zeros(boxes, MAILBOX)),
         tx=rows(np.zeros(boxes, MAILBOX)),
+        noisy=failures.needs_noise(fails),
     )
 
 
@@ -272,19 +277,19 @@ def _noise(generator: np.random.Philox, ticks: int) -> np.ndarray:
 
 def chances(here: World, run: int) -> Any:
     """Random numbers of a run, [trains, ticks] of plant.CHANCE, for the steps."""
-    return rows(np.stack([chance(train, here.seed, run) for train in here.members]))
+    return rows(np.stack([chance(train, here.seed, run, here.noisy) for train in here.members]))
 
 
-def chance(loaded: Loaded, seed: int, run: int) -> np.ndarray:
+def chance(loaded: Loaded, seed: int, run: int, noisy: bool = False) -> np.ndarray:
     """Random numbers of a train in a run, [run_ticks] of plant.CHANCE; only what the scenario uses
-    is drawn.
+    is drawn, and for `noisy` sensors their noise.
 
     A tick's number does not depend on when the run ends.
     """
     ticks = run_ticks(loaded, seed, run)
     first = STREAMS * loaded.train
     drawn = np.zeros(ticks, plant.CHANCE)
-    if loaded.scenario.sensors.speed_noise_m_s > 0:
+    if noisy or loaded.scenario.sensors.speed_noise_m_s > 0:
         drawn["speed_noise"] = _noise(_generator(seed, run, first + SPEED_NOISE), ticks)
     disturbance = loaded.scenario.disturbance
     if disturbance.amplitude_m_s2 > 0:

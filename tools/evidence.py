@@ -29,7 +29,7 @@ from tools.sil_faults import Side
 # What each side reads in a run of a train with six cars; the others are for the traces.
 READ = {
     CONTROLLER: (RUN_CTRL, ATP_LIMIT, TRAIN_SPEED, TRAIN_POSITION),
-    PLANT: (CAR_FORCE_1, CAR_FORCE_2, CAR_FORCE_3),
+    PLANT: (CAR_FORCE_1, CAR_FORCE_2, CAR_FORCE_3, FORCE_CMD),
 }
 
 
@@ -114,7 +114,7 @@ class Evidence:
 
 def _forces(frames: Any) -> list[Frame]:
     """The frames that carry forces."""
-    ids = {message.frame_id for message in (FORCE_CMD, *READ[PLANT])}
+    ids = {message.frame_id for message in READ[PLANT]}
     return [frame for frame in frames if frame[0] in ids]
 
 

@@ -12,17 +12,19 @@ from __future__ import annotations
 import json
 import os
 import queue
+import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Collection, Generator, Mapping
+from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
+from can_dbc.faults import Event, ProcessFault, append
 from can_dbc.hub import end_hung_hub
 from controller import calibration as calibrations
 from controller import store
@@ -236,6 +238,7 @@ def run(
     external: Collection[str] = (),
     cars: int = 0,
     faults: Path | None = None,
+    signals: Sequence[ProcessFault] = (),
     others: Mapping[str, list[str]] | None = None,
     real_time: RealTime | None = None,
 ) -> Generator[tuple[Node, dict[str, Any], Bench], None, None]:
@@ -244,7 +247,8 @@ def run(
 
     `buses` has an entry for each train, and so has `controllers`, or none where the controller is
     one of the `external` nodes; `cars` are those that the plant takes a force for, each by itself;
-    `faults` is the folder of can_dbc.faults.receiver; `others` are further nodes by name, modules
+    `faults` is the folder of can_dbc.faults.receiver, `signals` go to the processes when it is
+    time; `others` are further nodes by name, modules
     with their arguments. In lockstep, or in `real_time`.
 
     Raises RunError with one line if a node dies, falls silent or reports an error.
@@ -297,9 +301,11 @@ def run(
             yield node, node.said["ready"], bench
         leader.command(command="start")
         deadline = None
+        waiting = list(signals)
         while "done" not in leader.said or not bench.over(last_run(leader)):
             got = bench.next_event(0.5)
             if got is not None:
+                waiting = _strike(bench, waiting, got[1], faults)
                 yield (*got, bench)
             elif not external and time.monotonic() - leader.heard_s > SILENCE_S:
                 raise RunError(f"the {leader.name} process hangs: no word for {SILENCE_S:g} s")
@@ -310,6 +316,28 @@ def run(
                     run = last_run(leader)
                     late = [node.name for node in bench.accountants if last_run(node) != run]
                     raise RunError(f"the {', '.join(late)} has not seen the end of run {run}")
+
+
+def node_names(trains: int) -> list[str]:
+    """What the processes of a session are called."""
+    numbered = [f"{CONTROLLER}-{train}" for train in range(1, trains + 1)]
+    return [PLANT, "recorder", *(numbered if trains > 1 else [CONTROLLER])]
+
+
+def _strike(
+    bench: Bench, waiting: list[ProcessFault], event: dict[str, Any], log: Path | None
+) -> list[ProcessFault]:
+    """Sends the signals whose time has come by what the plant tells of its progress; the others."""
+    if event["event"] != "progress":
+        return waiting
+    run, tick = event["run"], event["tick"]
+    due = [each for each in waiting if (each.run, each.tick) <= (run, tick)]
+    for each in due:
+        bench.nodes[each.node].process.send_signal(signal.Signals[each.signal])
+        if log is not None:
+            struck = Event(run, tick, 1, each.node, "process", each.signal, 0, each.number)
+            append(log, "process", struck)
+    return [each for each in waiting if each not in due]
 
 
 def last_run(node: Node) -> int | None:

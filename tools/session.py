@@ -26,6 +26,7 @@ from controller import node
 from controller.calibration import Calibration
 from controller.interface import fault_names
 from controller.registry import is_file, load_law
+from plant_sim import failures
 from plant_sim.scenario import FOLDER, Loaded, at_rate, load, members
 from tools import environment, hil, line, realtime, record, setup, sil, sil_faults
 from tools.files import write_json, write_text
@@ -83,6 +84,16 @@ class Options:
     spin_us: int = 0  # real time: busy wait of the plant before each deadline
 
 
+@dataclass(frozen=True)
+class Faults:
+    """What a file of faults says."""
+
+    file: Path
+    bus: faults.Plan
+    plant: list[failures.AnyFailure]
+    processes: list[faults.ProcessFault]
+
+
 @dataclass
 class Session:
     """A session under way; `summary` is what summary.json holds."""
@@ -95,7 +106,7 @@ class Session:
     listener: Listener
     summary: dict[str, Any] = field(default_factory=dict)
     recording: record.Recording | None = None
-    plan: faults.Plan | None = None  # of the faults of the bus
+    faults: Faults | None = None  # to inject
     account: realtime.Account | None = None  # of a session in real time
 
 
@@ -117,12 +128,12 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
     if options.record is not None:
         record.check_target(options.record)
-    plan = None
+    asked = None
     if options.faults is not None:
-        plan = _fault_plan(options, options.faults, loaded)
+        asked = _faults(options, options.faults, loaded)
     prepare(options.out)
     listener.begin(loaded, law, runs)
-    session = Session(options, loaded, trains, law, runs, listener, plan=plan)
+    session = Session(options, loaded, trains, law, runs, listener, faults=asked)
     session.summary = {
         "schema": SCHEMA,
         "scenario": loaded.name,
@@ -162,20 +173,28 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     return session.summary
 
 
-def _fault_plan(options: Options, file: Path, loaded: Loaded) -> faults.Plan:
-    """The faults of the bus that are asked for. Raises FaultError, SessionError."""
+def _faults(options: Options, file: Path, loaded: Loaded) -> Faults:
+    """The faults that are asked for. Raises FaultError, SessionError."""
     if options.external:
         raise SessionError(f"{file}: faults are injected in nodes of ours, not in an external one")
     if options.mode == "mil":
         raise SessionError(f"{file}: faults need mode sil or hil, this is mil")
-    return faults.load(file, options.seed, loaded.scenario.period_s)
+    asked = Faults(
+        file,
+        faults.load(file, options.seed, loaded.scenario.period_s),
+        failures.load(file),
+        faults.load_signals(file, hil.node_names(loaded.trains), loaded.scenario.period_s),
+    )
+    if asked.processes and options.mode != "hil":
+        raise SessionError(f"{file}: [[process]] needs mode hil, this is {options.mode}")
+    return asked
 
 
-def _save_injected(session: Session, events: Sequence[faults.Event]) -> None:
+def _save_injected(session: Session, injected: Sequence[faults.Event]) -> None:
     """The log of injected faults as a table, and how many of each kind in the summary."""
-    kinds = Counter(event.kind for event in events)
+    kinds = Counter(event.kind for event in injected)
     session.summary["faults_injected"] = dict(sorted(kinds.items()))
-    write_text(session.options.out / "faults.csv", log_of(events))
+    write_text(session.options.out / "faults.csv", log_of(injected))
 
 
 def log_of(events: Sequence[faults.Event]) -> str:
@@ -313,7 +332,7 @@ def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
         injected: list[faults.Event] = []
         for results in _runs_in_process(session, nodes):
             injected += faults.in_order([each for result in results for each in result.injected])
-            if session.plan is not None:
+            if session.faults is not None:
                 _save_injected(session, injected)
             frames = [result.frames for result in results]
             truths = [result.truth for result in results]
@@ -343,10 +362,16 @@ def _runs_in_process(
 ) -> Iterator[list[sil.RunResult]]:
     """The runs, with the faults that are asked for."""
     loaded, seed, progress = session.loaded, session.options.seed, session.listener.progress
-    if session.plan is None:
+    if session.faults is None:
         return sil.run_line(loaded, nodes, runs=session.runs, seed=seed, progress=progress)
     return sil_faults.run_line(
-        loaded, nodes, runs=session.runs, seed=seed, plan=session.plan, progress=progress
+        loaded,
+        nodes,
+        runs=session.runs,
+        seed=seed,
+        plan=session.faults.bus,
+        fails=session.faults.plant,
+        progress=progress,
     )
 
 
@@ -445,8 +470,8 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
         session.account = realtime.Account(period_us, options.spin_us)
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch, _recording(session):
         kept = Path(scratch)
-        if session.plan is not None:
-            faults.save(session.plan, kept)
+        if session.faults is not None:
+            faults.save(session.faults.bus, session.faults.file, kept)
         events = hil.run(
             scenario=loaded.source,
             controllers=calibrations,
@@ -458,7 +483,8 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
             recorder_arguments=_recorder_arguments(session, kept),
             external=options.external,
             cars=_cars(loaded),
-            faults=None if session.plan is None else kept,
+            faults=None if session.faults is None else kept,
+            signals=session.faults.processes if session.faults is not None else [],
             real_time=real_time,
         )
         try:
@@ -467,7 +493,7 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
                     _on_event(session, bench, speaker.name, event, kept)
         finally:
             _record_the_rest(session, kept)
-            if session.plan is not None:
+            if session.faults is not None:
                 _save_injected(session, faults.injected(kept))
 
 

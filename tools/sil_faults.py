@@ -8,7 +8,7 @@ The same frames, faults and log as in HIL; some 15 000 ticks a second where the 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -20,7 +20,7 @@ from can_dbc.inbox import Inbox
 from controller import node as controller_node
 from controller.interface import fault_names
 from controller.process import inbox_of
-from plant_sim import plant, world
+from plant_sim import failures, plant, world
 from plant_sim.process import controller_name, echoes
 from plant_sim.scenario import Loaded
 from tools.frames import FRAME
@@ -74,12 +74,13 @@ def run_line(
     runs: range,
     seed: int,
     plan: Plan,
+    fails: Sequence[failures.AnyFailure] = (),
     progress: Callable[[int, int], None] | None = None,
     watch: Watch | None = None,
 ) -> Iterator[list[RunResult]]:
-    """As `tools.sil.run_line`, with the faults of `plan`. A run that a fault cuts short is the
-    last; its results say why."""
-    here = world.build(loaded, seed)
+    """As `tools.sil.run_line`, with the faults of `plan`, and with what fails in the plant. A run
+    that a fault cuts short is the last; its results say why."""
+    here = world.build(loaded, seed, fails)
     events: list[Event] = []
     sides = [
         Side(
@@ -89,7 +90,10 @@ def run_line(
             Inbox(
                 here.rx[train],
                 here.state["node"]["received"][train],
-                Receiver(plan, PLANT, train, events.append),
+                Receiver(
+                    *(plan, PLANT, train, events.append),
+                    failures.planned(fails, train, loaded.scenario.period_s),
+                ),
             ),
             here.rx[train],
             here.state["node"]["received"][train],

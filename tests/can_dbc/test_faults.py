@@ -348,7 +348,7 @@ def test_every_bit_is_flipped_alike(heard) -> None:
 
 
 def test_another_process_reads_plan_and_log(tmp_path: Path) -> None:
-    faults.save(plan(MANY, tmp_path), tmp_path)
+    faults.save(plan(MANY, tmp_path), tmp_path / "faults.toml", tmp_path)
     log: list[Event] = []
     for node in (PLANT, CONTROLLER):
         mine = Receiver(plan(MANY, tmp_path), node, 0, log.append)

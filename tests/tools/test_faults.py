@@ -6,8 +6,11 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from tools import session
 
 FAULTS = """
 [[bus]]
@@ -54,6 +57,22 @@ kind = "silence"
 node = "CONTROLLER"
 from = 8.0
 to = 8.02
+[[sensor]]
+kind = "slip"
+share = 0.05
+from = 3.0
+to = 4.0
+[[sensor]]
+kind = "noise"
+quantity = "speed"
+deviation = 0.02
+from = 4.0
+to = 6.0
+[[actuator]]
+kind = "traction"
+share = 0.7
+from = 2.0
+to = 2.5
 """
 
 
@@ -65,6 +84,7 @@ def short(short_text, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_bus_and_one_process_inject_the_same(ato_hil, short: Path, tmp_path: Path) -> None:
     (tmp_path / "faults.toml").write_text(FAULTS)
     options = ("run", str(short), "--faults", "faults.toml")
@@ -81,7 +101,10 @@ def test_a_bus_and_one_process_inject_the_same(ato_hil, short: Path, tmp_path: P
 
     rows = list(csv.DictReader(logs["hil"].splitlines()))
     kinds = {"drop", "corrupt", "delay", "duplicate", "reorder", "masquerade", "insert"}
-    assert {row["kind"] for row in rows} == kinds | {"babble", "stuck", "silence"}
+    in_the_train = {"slip", "noise", "traction"}
+    assert {row["kind"] for row in rows} == kinds | {"babble", "stuck", "silence"} | in_the_train
+    begins = [(row["kind"], row["tick"]) for row in rows if row["kind"] in in_the_train]
+    assert begins == [("traction", "200"), ("slip", "300"), ("noise", "400")]
     assert {row["node"] for row in rows} == {"controller", "plant"}
     injected = found["hil"]["faults_injected"]
     assert {kind: sum(row["kind"] == kind for row in rows) for kind in injected} == injected
@@ -124,24 +147,98 @@ def test_a_run_that_cannot_begin_ends_with_its_cause(
     assert (tmp_path / "o" / "trace.rrd").stat().st_size > 0
 
 
+class Nobody:
+    """Watches a session that does not begin."""
+
+    def begin(self, *_: Any) -> None: ...
+    def note(self, text: str) -> None: ...
+    def progress(self, run: int, tick: int) -> None: ...
+    def row(self, row: dict[str, Any]) -> None: ...
+
+
+def asked(scenario: Path, folder: Path, text: str | None, **options: Any) -> session.Options:
+    """A session with this file of faults."""
+    file = folder / "faults.toml"
+    if text is not None:
+        file.write_text(text)
+    return session.Options(
+        **{
+            **{"scenario": str(scenario), "law": None, "runs": None, "mode": "sil"},
+            **{"bus": "none", "seed": 1, "out": folder / "o", "memory": None},
+            **options,
+        },
+        faults=file,
+    )
+
+
+PROCESS = '[[process]]\nnode = "{}"\nsignal = "{}"\nat_s = 1.0\n'
+
+
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("text", "options", "says"),
     [
-        (("--faults", "none.toml"), "none.toml: cannot be read: No such file or directory"),
-        (("--faults", "bad.toml"), "bad.toml: key bus[0].kind: Invalid value 'x', expected one of"),
+        (None, {}, "cannot be read: No such file or directory"),
+        ("[[bus]]\nkind = 'x'", {}, "key bus[0].kind: Invalid value 'x', expected one of"),
+        ("[[sensor]]\nkind = 'x'", {}, "key sensor[0].kind: Invalid value 'x', expected one of"),
+        ("", {"external": ("controller",)}, "faults are injected in nodes of ours, not in an ext"),
+        ("", {"mode": "mil"}, "faults need mode sil or hil, this is mil"),
+        (PROCESS.format("plant", "SIGKILL"), {}, "[[process]] needs mode hil, this is sil"),
         (
-            ("--faults", "good.toml", "--external", "controller"),
-            "good.toml: faults are injected in nodes of ours, not in an external one",
+            PROCESS.format("x", "SIGKILL"),
+            {"mode": "hil"},
+            "key process[0]: node is 'x', expected one of plant",
+        ),
+        (
+            PROCESS.format("plant", "x"),
+            {"mode": "hil"},
+            "key process[0]: signal is 'x', expected SIGKILL or",
         ),
     ],
 )
 def test_bad_input_is_one_line(
-    ato_hil, short: Path, tmp_path: Path, arguments: tuple[str, ...], says: str
+    short: Path, tmp_path: Path, text: str | None, options: dict, says: str
 ) -> None:
-    (tmp_path / "bad.toml").write_text('[[bus]]\nkind = "x"\n')
-    (tmp_path / "good.toml").write_text('[[bus]]\nkind = "drop"\n')
-    done = ato_hil("run", str(short), *arguments, "--out", "o", cwd=tmp_path)
-    assert done.returncode == 1
-    assert done.stderr.startswith(f"ato-hil: {says}")
-    assert len(done.stderr.strip().splitlines()) == 1
+    if "external" in options:
+        options = {**options, "mode": "hil"}
+    with pytest.raises(ValueError) as refused:
+        session.run(asked(short, tmp_path, text, **options), Nobody())
+    assert str(refused.value).startswith(f"{tmp_path / 'faults.toml'}: {says}")
+    assert "\n" not in str(refused.value)
     assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("node", "signal", "cause"),
+    [
+        ("controller", "SIGKILL", "the controller process ended (signal 9)"),
+        ("controller", "SIGSTOP", "controller is silent: no FORCE_CMD for tick"),
+        ("plant", "SIGKILL", "the plant process ended (signal 9)"),
+    ],
+)
+def test_a_signal_ends_the_run_with_its_cause(
+    ato_hil, short: Path, tmp_path: Path, node: str, signal: str, cause: str
+) -> None:
+    (tmp_path / "faults.toml").write_text(
+        f'[[process]]\nnode = "{node}"\nsignal = "{signal}"\nat_s = 1.0\n'
+    )
+    bus = ("--bus", f"hub:{tmp_path.name[-20:]}")
+    done = ato_hil(
+        "run",
+        str(short),
+        *bus,
+        "--runs",
+        "9",
+        "--faults",
+        "faults.toml",
+        "--out",
+        "o",
+        cwd=tmp_path,
+    )
+    assert done.returncode == 3
+    assert done.stderr.startswith(f"ato-hil: {cause}")
+    summary = json.loads((tmp_path / "o" / "summary.json").read_text())
+    assert summary["faults_injected"] == {signal: 1}
+    (row,) = csv.DictReader((tmp_path / "o" / "faults.csv").read_text().splitlines())
+    assert (row["run"], row["node"], row["kind"]) == ("1", node, signal)
+    assert int(row["tick"]) >= 100
