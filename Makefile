@@ -19,7 +19,7 @@ DEV_READY := .venv/dev.ready
 COMPILE := .venv/bin/python -m uv pip compile pyproject.toml --universal --generate-hashes --group build \
 	--no-header --no-annotate --no-emit-index-url --quiet
 
-.PHONY: help hil test long test-socketcan verify golden pareto figures claims docs lint types lock clean
+.PHONY: help hil test long test-socketcan verify golden pareto figures pictures claims docs lint types lock clean
 
 help: ## list the targets
 	sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 23
@@ -95,6 +95,19 @@ claims: $(RUN_READY) ## measure what the papers claim again, and write it into d
 
 docs: $(RUN_READY) ## write docs/messages.md and docs/command-line.md again, from DBC and program
 	.venv/bin/python -m tools.docs
+# The viewer draws them without a screen, with Vulkan in software: mesa-vulkan-drivers is for this.
+pictures: $(RUN_READY) ## draw the screenshots of the viewer in docs/ again
+	.venv/bin/ato-hil run subway --mode sil --runs 5 --out runs/pictures/cailc
+	for law in cailc pdilc; do
+		.venv/bin/ato-hil run subway-paper --law $$law --mode sil --runs 8 --out "runs/pictures/paper-$$law"
+	done
+	.venv/bin/ato-hil run line --mode sil --runs 1 --out runs/pictures/line
+	.venv/bin/ato-hil view runs/pictures/cailc --screenshot docs/trace.png
+	.venv/bin/ato-hil view runs/pictures/cailc --tab learning --screenshot docs/trace-learning.png
+	.venv/bin/ato-hil view runs/pictures/cailc --tab bus --screenshot docs/trace-bus.png
+	.venv/bin/ato-hil view runs/pictures/line --screenshot docs/trace-line.png
+	.venv/bin/ato-hil view --law-compare runs/pictures/paper-cailc runs/pictures/paper-pdilc \
+		--screenshot docs/trace-compare.png
 
 lint: $(DEV_READY) ## ruff: lint and format
 	.venv/bin/python -m ruff check .

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import numpy as np
 
 from can_dbc.bus import choose_bus, open_bus
 from plant_sim.scenario import load
-from tools import session, setup, sil
+from tools import live, session, setup, sil
 
 SCENARIO = "subway-fast"
 HIL_SCENARIO = "subway"
@@ -54,13 +55,28 @@ class _Silent:
 def measure(bus: str) -> list[Figure]:
     """SIL and HIL rates with their peers."""
     peer = control_rate()
-    return [
+    figures = [
         Figure("SIL, whole chain, traces off", sil_rate(), "python-control", peer),
         Figure("SIL, 250 000 ticks a run, whole session", session_rate(), "python-control", peer),
         Figure(
             "HIL, three processes, trace on", hil_rate(bus), "bare python-can echo", echo_rate(bus)
         ),
     ]
+    with suppress(live.ViewerError):  # without a viewer there is nothing to measure
+        alone, watched = watched_rates(bus)
+        figures.append(Figure("HIL, viewer looking on", watched, "HIL without it", alone))
+    return figures
+
+
+def watched_rates(bus: str) -> tuple[float, float]:
+    """Rates of HIL without and with a viewer that draws what comes, ticks/s: medians of two
+    sessions each, in turns."""
+    alone, watched = [], []
+    for _ in range(2):
+        alone.append(hil_rate(bus))
+        with live.LiveView(live.HEADLESS) as viewer:
+            watched.append(hil_rate(bus, viewer))
+    return float(np.median(alone)), float(np.median(watched))
 
 
 def sil_rate() -> float:
@@ -134,10 +150,12 @@ def control_rate() -> float:
     return TICKS_OF_PEER / (time.perf_counter() - started)
 
 
-def hil_rate(bus: str) -> float:
+def hil_rate(bus: str, viewer: live.LiveView | None = None) -> float:
     """Median rate of three HIL runs with recorder and trace, ticks/s."""
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as folder:
-        options = session.Options(HIL_SCENARIO, None, 3, "hil", bus, 1, Path(folder), None)
+        options = session.Options(
+            HIL_SCENARIO, None, 3, "hil", bus, 1, Path(folder), None, viewer=viewer
+        )
         summary = session.run(options, _Silent())
     return float(np.median([row["ticks_per_s"] for row in summary["runs"]]))
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +16,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+
+from tools.live import LiveView
 
 if TYPE_CHECKING:
     from plant_sim.scenario import Loaded
@@ -53,6 +56,13 @@ class External(StrEnum):
 
     controller = "controller"
     plant = "plant"
+
+
+class Viewer(StrEnum):
+    """Where the trace is shown."""
+
+    native = "native"
+    web = "web"
 
 
 class Pace(StrEnum):
@@ -270,6 +280,13 @@ def run(
         Path | None,
         typer.Option(help="Faults to inject, a .toml file: see docs/faults.md."),
     ] = None,
+    view: Annotated[
+        Viewer | None,
+        typer.Option(
+            help="Look on while it runs: --view opens the viewer, --view web serves it to a browser"
+            " of this machine."
+        ),
+    ] = None,
 ) -> None:
     """Run a scenario: the train follows its profile, run by run."""
     if mode is Mode.mil and os.environ.get("ATO_HIL_INTERPRETED") != "1":
@@ -279,12 +296,20 @@ def run(
         os.execve(sys.executable, [sys.executable, "-m", "tools.cli", *sys.argv[1:]], environment)
     with one_line_for_bad_input():
         nodes = tuple(dict.fromkeys(node.value for node in external or ()))
-        _run(
-            *(scenario, law, runs, mode, bus, seed, out, memory, trace, record, nodes),
-            faults=faults,
-            pace=pace.value,
-            spin_us=spin_us,
-        )
+        with ExitStack() as stack:
+            stack.enter_context(_sigterm_as_ctrl_c())
+            viewer = None
+            if view is not None:
+                if not trace:
+                    raise _fail("--view shows the trace, so not with --no-trace", EXIT_BAD_INPUT)
+                viewer = stack.enter_context(LiveView(view.value))
+            _run(
+                *(scenario, law, runs, mode, bus, seed, out, memory, trace, record, nodes),
+                faults=faults,
+                pace=pace.value,
+                spin_us=spin_us,
+                viewer=viewer,
+            )
 
 
 @contextmanager
@@ -312,6 +337,7 @@ def _run(
     record: Path | None,
     external: tuple[str, ...],
     faults: Path | None,
+    viewer: LiveView | None,
     **more: Any,
 ) -> None:
     from controller.registry import law_label
@@ -328,6 +354,7 @@ def _run(
     options = session.Options(
         *(scenario, law, runs, mode.value, bus, seed, folder, memory, trace, record, external),
         faults=faults,
+        viewer=viewer,
         **more,
     )
     screen = Screen(mode)
@@ -336,7 +363,9 @@ def _run(
             summary = session.run(options, screen)
     except RunError as error:
         _print_table(screen)
-        raise _fail(f"{error}; the runs so far are in {folder}", EXIT_ENDED_EARLY) from None
+        failure = _fail(f"{error}; the runs so far are in {folder}", EXIT_ENDED_EARLY)
+        _wait_for(viewer)
+        raise failure from None
     except KeyboardInterrupt:
         _print_table(screen)
         raise _fail(f"interrupted; the runs so far are in {folder}", EXIT_INTERRUPTED) from None
@@ -350,13 +379,82 @@ def _run(
     console.print(f"summary {folder / 'summary.json'}", soft_wrap=True)
     if trace:
         trace_file = folder / "trace.rrd"
-        console.print(f"trace   {trace_file}   (open it with: rerun {trace_file})", soft_wrap=True)
+        cost = summary["trace"]
+        size = f"{cost['bytes'] / 1e6:.1f} MB, {cost['us_per_frame']:.2f} µs a frame"
+        console.print(f"trace   {trace_file}   {size}", soft_wrap=True)
+        console.print(f"        (open it with: ato-hil view {folder})", soft_wrap=True)
     if faults is not None:
         injected = ", ".join(f"{n} {kind}" for kind, n in summary["faults_injected"].items())
         log = folder / "faults.csv"
         console.print(f"faults  {log}   (injected: {injected or 'none'})", soft_wrap=True)
     if record is not None:
         console.print(f"record  {record}   (again: ato-hil replay {record})", soft_wrap=True)
+    _wait_for(viewer)
+
+
+@contextmanager
+def _sigterm_as_ctrl_c() -> Iterator[None]:
+    """What SIGTERM ends, ends as with Ctrl-C: with what it has."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _wait_for(viewer: LiveView | None) -> None:
+    """Until the viewer is closed; Ctrl-C closes it."""
+    if viewer is not None:
+        with suppress(KeyboardInterrupt):
+            viewer.wait()
+
+
+@app.command()
+def view(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="What `ato-hil run` wrote; several are overlaid."),
+    ],
+    law_compare: Annotated[
+        bool, typer.Option("--law-compare", help="Errors by run first, side by side.")
+    ] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve it to a browser of this machine.")
+    ] = False,
+    screenshot: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.png", help="Write a picture instead; needs no screen."),
+    ] = None,
+    tab: Annotated[
+        str | None, typer.Option(help="Of the picture, such as Learning; the first by default.")
+    ] = None,
+) -> None:
+    """Show finished runs in the viewer."""
+    from tools import live
+    from tools import view as finished
+
+    with one_line_for_bad_input(), _sigterm_as_ctrl_c():
+        recorded = finished.load(folders)
+        with finished.prepared(recorded, law_compare) as trace:
+            if screenshot is not None:
+                finished.screenshot(trace, screenshot, tab)
+                console.print(f"picture {screenshot}", soft_wrap=True)
+                return
+            kind = live.WEB if web else live.NATIVE
+            live.check(kind)
+            process, text = live.show(kind, [str(trace.resolve())])
+            console.print(text, soft_wrap=True)
+            try:
+                status = process.wait()
+            except KeyboardInterrupt:
+                live.end(process)
+            else:
+                if status:
+                    raise _fail(f"the viewer ended with exit status {status}", EXIT_BAD_INPUT)
 
 
 def _print_timing(timing: dict[str, Any]) -> None:
@@ -1017,6 +1115,10 @@ def endurance(
 
 def main() -> None:
     """Entry point of the console script."""
+    for at, word in enumerate(sys.argv):
+        # `--view` alone is an option with a value that may be left out, which typer does not have.
+        if word == "--view" and sys.argv[at + 1 : at + 2] not in (["web"], ["native"]):
+            sys.argv[at] = f"--view={Viewer.native.value}"
     app()
 
 

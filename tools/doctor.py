@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import platform
-import shutil
 import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+
+VULKAN_DRIVERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ def examine() -> list[Finding]:
         _vcan0(),
         _private_vcan(),
         _viewer(),
+        _pictures(),
     ]
 
 
@@ -128,13 +130,25 @@ def _private_vcan() -> Finding:
 
 
 def _viewer() -> Finding:
-    beside = Path(sys.executable).with_name("rerun")
-    found = shutil.which("rerun") or (str(beside) if beside.exists() else None)
-    if found is None:
-        return Finding("viewer", "absent", "no `rerun` command; pip install rerun-sdk brings it")
-    return Finding(
-        "viewer",
-        "works",
-        f"{Path(found).name} is installed;"
-        " on a machine with no screen: rerun --serve-web --bind 127.0.0.1 TRACE",
-    )
+    from tools import live
+
+    try:
+        live.binary()
+    except live.ViewerError as error:
+        return Finding("viewer", "absent", str(error))
+    if not live.has_screen():
+        return Finding("viewer", "works", "there is no screen here: `--view web`, `view --web`")
+    return Finding("viewer", "works", "it is installed; `--view`, `ato-hil view DIR`")
+
+
+def _pictures() -> Finding:
+    """Without a graphics card the viewer draws with Vulkan in software."""
+    found = [path for folder in VULKAN_DRIVERS for path in Path(folder).glob("*.json")]
+    if sys.platform == "linux" and not found:
+        return Finding(
+            "pictures of the viewer",
+            "absent",
+            "no Vulkan driver, which `view --screenshot` needs:"
+            " apt-get install mesa-vulkan-drivers",
+        )
+    return Finding("pictures of the viewer", "works", "`view --screenshot` can draw")

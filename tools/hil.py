@@ -38,6 +38,7 @@ STOP_TIMEOUT_S = 0.7  # of a node that was asked to end
 STOPPED_S = 2.0  # a process may be stopped for as long
 SILENCE_S = 10.0  # longest without a word of the plant
 ACCOUNT_TIMEOUT_S = 60.0  # from the end of the last run to every node's account of it
+TRACE_TIMEOUT_S = 30.0  # for the recorder to complete the trace
 
 
 class RunError(Exception):
@@ -75,11 +76,13 @@ class RealTime:
 
 
 class Bench:
-    """The nodes of one run. Use as a context manager: leaving it ends every node."""
+    """The nodes of one run. Use as a context manager: leaving it ends every node, but for a
+    recorder that goes on serving viewers (`linger`) until `release`."""
 
-    def __init__(self, out: Path, buses: list[str]) -> None:
+    def __init__(self, out: Path, buses: list[str], linger: bool = False) -> None:
         self.out = out
         self.buses = buses
+        self.linger = linger
         self.nodes: dict[str, Node] = {}
         self.accountants: list[Node] = []  # besides the leader: each tells of a run when it is over
         self.events: queue.Queue[tuple[Node, dict[str, Any]]] = queue.Queue()
@@ -180,10 +183,28 @@ class Bench:
         if recorder is not None:
             if recorder.process.poll() is None:
                 recorder.command(command="stop")
-            _wait(recorder, 30.0)
+            self._hear_the_last_of(recorder, time.monotonic() + TRACE_TIMEOUT_S)
+            if not self.linger:
+                _wait(recorder, STOP_TIMEOUT_S)
         for node in self.nodes.values():
             if node.log.exists() and node.log.stat().st_size == 0:
                 node.log.unlink()
+
+    def _hear_the_last_of(self, recorder: Node, deadline: float) -> None:
+        """Until the recorder has said that its trace is complete, or has ended."""
+        while not {"traced", "closed"} & recorder.said.keys():
+            try:
+                node, event = self.events.get(timeout=max(deadline - time.monotonic(), 0.0))
+            except queue.Empty:
+                return
+            node.said[event["event"]] = event
+
+    def release(self) -> None:
+        """Ends a recorder that serves viewers."""
+        recorder = self.nodes.get("recorder")
+        if recorder is not None:
+            recorder.process.terminate()
+            _wait(recorder, STOP_TIMEOUT_S)
 
 
 def _is_stopped(node: Node) -> bool:
@@ -241,6 +262,7 @@ def run(
     signals: Sequence[ProcessFault] = (),
     others: Mapping[str, list[str]] | None = None,
     real_time: RealTime | None = None,
+    linger: bool = False,
 ) -> Generator[tuple[Node, dict[str, Any], Bench], None, None]:
     """Events of the nodes, `ready` of each first, until all runs are done and recorded; see the
     `tell` calls of the processes.
@@ -248,8 +270,8 @@ def run(
     `buses` has an entry for each train, and so has `controllers`, or none where the controller is
     one of the `external` nodes; `cars` are those that the plant takes a force for, each by itself;
     `faults` is the folder of can_dbc.faults.receiver, `signals` go to the processes when it is
-    time; `others` are further nodes by name, modules
-    with their arguments. In lockstep, or in `real_time`.
+    time; `others` are further nodes by name, modules with their arguments; `linger` as in Bench. In
+    lockstep, or in `real_time`.
 
     Raises RunError with one line if a node dies, falls silent or reports an error.
     """
@@ -259,7 +281,7 @@ def run(
     with (
         ExitStack() as afterwards,
         tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch,
-        Bench(out, buses) as bench,
+        Bench(out, buses, linger) as bench,
     ):
         if memory_file is not None:
             afterwards.callback(store.remove_unfinished, memory_file)

@@ -13,14 +13,20 @@ It says on stdout, in JSON lines:
      "digest": "…", "digests": ["…"],                      frames of other kinds, digest of all runs
      "complete": true}                                     so far, and that of each train
     {"event": "error", "message": "…"}                     it ends early
+    {"event": "traced", "us_per_frame": …}                 the trace is complete; time for a frame
 
 and takes on stdin, where a file is deleted when it has been read:
 
     {"command": "reference", "run": 1, "file": "x.npy"}    of a run on a timetable of its own
     {"command": "truth", "run": 1, "file": "truth.npy"}    true state of the plant, for the trace
     {"command": "timing", "run": 1, "file": "timing.npy"}  how punctual a run in real time was
+    {"command": "memory", "run": 1, "file": "memory.npy",  the learning memory after it, in the
+     "decimation": 10}                                     units of its words, likewise
     {"command": "summary", "run": 1, "row": {…}}           the run's row of summary.json, likewise
-    {"command": "stop"}                                    as SIGTERM, SIGINT and the end of stdin
+    {"command": "stop"}                                    ends the recording, as SIGTERM, SIGINT
+                                                           and the end of stdin do
+
+A recorder that serves viewers goes on doing so after "stop", until one of the others.
 """
 
 from __future__ import annotations
@@ -175,12 +181,16 @@ class Recorder:
                 self._log(int(np.searchsorted(self.frames["tick"], self.tick)))
 
     def obey(self, command: dict[str, Any]) -> None:
-        """Log what the parent knows of a run: `reference`, `truth`, `timing` or `summary`."""
+        """Log what the parent knows of a run: `reference`, `truth`, `memory`, `timing` or
+        `summary`."""
         if self._trace is None:
             return
         if command["command"] == "reference":
             reference = np.load(command["file"]).view(np.recarray)
             self._trace.reference(command["run"], cast(Reference, reference))
+        elif command["command"] == "memory":
+            cells = np.load(command["file"])
+            self._trace.memory(command["run"], cells, command["decimation"])
         elif command["command"] == "truth":
             tables = np.atleast_2d(np.load(command["file"]))  # of all trains
             self._trace.truth(command["run"], tables[self._train], self._train)
@@ -292,13 +302,14 @@ def record(
     commands: queue.SimpleQueue[dict[str, Any]],
     stop: Stop,
 ) -> None:
-    """Record until `stop`. Raises can.CanError if a bus is gone."""
-    while not stop.requested:
+    """Record until `stop`, or the command of that name. Raises can.CanError if a bus is gone."""
+    ended = False
+    while not (ended or stop.requested):
         heard = listen(taps, IDLE_S)
         while not commands.empty():
             command = commands.get()
             if command["command"] == "stop":
-                stop.requested = True
+                ended = True
             else:
                 for _bus, recorder in taps:
                     recorder.obey(command)
@@ -399,13 +410,19 @@ def main() -> int:
     except (OSError, ValueError) as error:
         tell("error", message=f"recorder: {error}")
         status = 1
+    whole = True
     try:
         for bus, recorder in reversed(taps):
             recorder.finish(dropped_frames(bus))
     except (OSError, ValueError) as error:
         tell("error", message=f"recorder: {error}")
-        status = 1
+        status, whole = 1, False
     opened.close()
+    if trace is not None and whole:
+        tell("traced", us_per_frame=trace.us_per_frame)
+        while trace.is_live and not stop.requested:
+            time.sleep(IDLE_S)
+        trace.end_live()
     return status
 
 

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from tools import realtime
+from tools.blueprints import title_of
 from tools.figures import draw, style
 from tools.figures.folder import Folder, FolderError, read
 from tools.files import write_text
-from tools.trace import title_of
 
 SESSION = ("scenario", "law", "mode", "pace", "bus", "external", "seed", "ended_early")
 DIGESTS = ("digest", "digests", "scenario_digest")

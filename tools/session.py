@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy as np
 
 from can_dbc import faults
 from can_dbc.bus import choose_bus, open_bus, recv_frames
-from controller import node
+from controller import node, store
 from controller.calibration import Calibration
 from controller.interface import fault_names
 from controller.registry import is_file, load_law
@@ -32,9 +32,11 @@ from tools import environment, hil, line, realtime, record, setup, sil, sil_faul
 from tools.files import write_json, write_text
 from tools.frames import LineDigest, timetable_rate
 from tools.hil import RunError
+from tools.live import LiveView
 from tools.lyapunov import has_lyapunov, lyapunov
 from tools.observer import CONTROLLER, PATIENCE_S, PLANT, measured_truth
 from tools.recorder import frames_folder, save_settings
+from tools.trace import TraceWriter
 
 SCHEMA = 1
 EXTERNAL_LAW = "external"  # of a controller that is not ours
@@ -82,6 +84,7 @@ class Options:
     faults: Path | None = None  # file of faults to inject
     pace: str = LOCKSTEP
     spin_us: int = 0  # real time: busy wait of the plant before each deadline
+    viewer: LiveView | None = None  # that looks on
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,9 @@ class Session:
     recording: record.Recording | None = None
     faults: Faults | None = None  # to inject
     account: realtime.Account | None = None  # of a session in real time
+    recorder: hil.Node | None = None  # of HIL
+    words: tuple[str, ...] = ()  # of the learning memory, where the trace gets it
+    us_per_frame: float | None = None  # that the trace has taken
 
 
 def run(options: Options, listener: Listener) -> dict[str, Any]:
@@ -134,6 +140,8 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     prepare(options.out)
     listener.begin(loaded, law, runs)
     session = Session(options, loaded, trains, law, runs, listener, faults=asked)
+    if calibrations:
+        session.words = _words(options, law, calibrations)
     session.summary = {
         "schema": SCHEMA,
         "scenario": loaded.name,
@@ -169,6 +177,11 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     finally:
         if session.account is not None:
             session.summary["timing"] = session.account.summary()
+        if session.us_per_frame is not None:
+            session.summary["trace"] = {
+                "bytes": (options.out / "trace.rrd").stat().st_size,
+                "us_per_frame": session.us_per_frame,
+            }
         write_json(options.out / "summary.json", session.summary)
     return session.summary
 
@@ -237,6 +250,14 @@ def _controllers(options: Options, trains: list[Loaded]) -> tuple[str, list[Cali
     calibrations = [setup.calibration_for(train, law) for train in trains]
     learned = -1 if options.memory is None else node.last_iteration(calibrations[0], options.memory)
     return law, calibrations, setup.run_numbers(law, count, learned)
+
+
+def _words(options: Options, law: str, calibrations: list[Calibration]) -> tuple[str, ...]:
+    """Names of the words of the learning memory, where it can be had: it is not on the bus."""
+    if len(calibrations) > 1 or (options.mode == "hil" and options.memory is None):
+        return ()
+    stored = int(calibrations[0].params[0]["memory"]["words"])
+    return tuple(f"{name} [{unit}]" for name, unit, _q in load_law(law).WORDS[:stored])
 
 
 def prepare(out: Path) -> None:
@@ -328,7 +349,8 @@ def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
         writer = None
         if options.trace:
             writer = _trace_writer(session)
-            stack.callback(writer.close)
+            stack.callback(_close_trace, session, writer)
+            _look_on(session, writer.end_live)
         injected: list[faults.Event] = []
         for results in _runs_in_process(session, nodes):
             injected += faults.in_order([each for result in results for each in result.injected])
@@ -350,6 +372,10 @@ def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
                 for table in (np.stack(truths), *_own_columns(session, frames, truths)):
                     for train, column in enumerate(table):
                         writer.truth(run, column, train)
+                if session.words:
+                    generation = int(nodes[0].state[0]["memory"]["generation"])
+                    cells = nodes[0].cells[generation]
+                    writer.memory(run, *_learned(session, calibrations[0], cells))
             if results[0].cut:
                 raise RunError(results[0].cut)
             row = _finish_run(session, run, frames, truths, seconds, latched)
@@ -389,6 +415,29 @@ def _own_reference(session: Session, frames: list[np.ndarray]) -> Any:
     return table.view(np.recarray)
 
 
+def _close_trace(session: Session, writer: TraceWriter) -> None:
+    writer.close()
+    session.us_per_frame = writer.us_per_frame
+
+
+def _look_on(session: Session, when_closed: Callable[[], object]) -> None:
+    """Opens the viewer, where one is asked for, on what is served now."""
+    viewer = session.options.viewer
+    if viewer is not None:
+        viewer.when_closed(when_closed)
+        session.listener.note(viewer.start())
+
+
+def _learned(
+    session: Session, calibration: Calibration, cells: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """What the cells of the learning memory hold in the units of its words, and the ticks of a
+    cell."""
+    memory = calibration.params[0]["memory"]
+    scale = [float(memory["scale"]) / 2.0**q for _name, _unit, q in load_law(session.law).WORDS]
+    return cells * np.array(scale[: cells.shape[1]]), int(memory["decimation"])
+
+
 def _own_columns(
     session: Session, frames: list[np.ndarray], truths: list[np.ndarray]
 ) -> Iterator[np.ndarray]:
@@ -412,6 +461,8 @@ def _trace_settings(session: Session) -> dict[str, Any]:
         "cars": _cars(loaded),
         "trains": len(session.members),
         "spacing_m": loaded.scenario.line.spacing_m if loaded.scenario.line else 0.0,
+        "words": session.words,
+        "live_port": session.options.viewer.port if session.options.viewer else None,
     }
 
 
@@ -421,9 +472,7 @@ def _cars(loaded: Loaded) -> int:
     return len(scenario.train.effectiveness) if scenario.control.distribute else 0
 
 
-def _trace_writer(session: Session) -> Any:
-    from tools.trace import TraceWriter
-
+def _trace_writer(session: Session) -> TraceWriter:
     return TraceWriter(
         session.options.out / "trace.rrd",
         reference=session.loaded.profile,
@@ -486,6 +535,7 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
             faults=None if session.faults is None else kept,
             signals=session.faults.processes if session.faults is not None else [],
             real_time=real_time,
+            linger=options.viewer is not None,
         )
         try:
             with closing(events):  # whatever ends the session ends the nodes
@@ -495,6 +545,8 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
             _record_the_rest(session, kept)
             if session.faults is not None:
                 _save_injected(session, faults.injected(kept))
+            if session.recorder is not None and "traced" in session.recorder.said:
+                session.us_per_frame = session.recorder.said["traced"]["us_per_frame"]
 
 
 def _record_the_rest(session: Session, kept: Path) -> None:
@@ -532,6 +584,9 @@ def _on_event(
             "state_bytes": event["state_bytes"],
             "memory_bytes": event["memory_bytes"],
         }
+    elif kind == "ready" and name == "recorder":
+        session.recorder = bench.nodes[name]
+        _look_on(session, bench.release)
     elif kind == "ready" and name == "observer":
         nodes = " and ".join(session.options.external)
         session.listener.note(f"ready; the {nodes} may join within {PATIENCE_S:g} s")
@@ -604,4 +659,18 @@ def _on_run(
     row = _finish_run(
         session, run, frames, truths, led["seconds"], latched, frames_lost, timing=timing
     )
+    if session.words:
+        _tell_memory(session, tap, run, kept)
     tap.command(command="summary", run=run, row=row)
+
+
+def _tell_memory(session: Session, tap: hil.Node, run: int, kept: Path) -> None:
+    """The learning memory of the run to the recorder, if its file is still that of this run."""
+    assert session.options.memory is not None
+    calibration = setup.calibration_for(session.loaded, session.law)
+    stored = store.load(session.options.memory, calibration)
+    if stored.iteration == run:
+        cells, decimation = _learned(session, calibration, stored.cells)
+        file = kept / f"memory_{run}.npy"
+        np.save(file, cells)
+        tap.command(command="memory", run=run, file=str(file), decimation=decimation)

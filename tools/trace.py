@@ -6,11 +6,16 @@ beside it in a branch of its own:
     /bus/PLOT/run_NN        signals of one plot, a vector a tick, units of the DBC
     /bus/state/run_NN/LANE  states and faults, a row a change
     /bus/frames/run_NN      every frame of a tick as it was: identifiers and payloads
+    /bus/load/run_NN        load by message, kbit/s, a row a second; /bus/silence: longest, ms
+    /bus/messages           table of what each message did in the run that is shown
+    /bus/end_to_end/run_NN  what the end-to-end check says of each message, a row a change
     /truth/FIELD/run_NN     true state of the plant, and its errors against the reference
     /reference/FIELD        the reference as planned
     /reference/FIELD/run_NN that of a run on a timetable of its own
     /timing/run_NN/FIELD    how punctual the nodes were in real time, µs
     /runs/KEY               the summary of each run, on timeline `run`
+    /memory/word_N          what the learning memory held after each run, over position
+    /over_position/speed    speed and its limits of the run that ended last
     /events                 texts
 
 Of a line of several trains, each run_NN has an entity train_NN for each of them.
@@ -22,8 +27,9 @@ Runs share the first two, so that a view that takes a plot of several runs overl
 from __future__ import annotations
 
 import hashlib
+import time
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -53,29 +59,42 @@ from can_dbc.codec import (
 )
 from can_dbc.faults import Event
 from controller.interface import fault_names
+from tools import charts
+from tools.blueprints import BARS, Layout, of_session, title_of
+from tools.charts import Curve, curves, memory_map
+from tools.colours import (
+    AHEAD,
+    APART,
+    BEHIND,
+    BLUE,
+    COMMANDED,
+    GREY,
+    MEASURED,
+    ORANGE,
+    PERMITTED,
+    PINK,
+    REFERENCE,
+    STATES,
+    TARGET,
+    TRUE,
+    VIOLET,
+    YELLOW,
+    Colour,
+    apart,
+    ramp,
+)
 from tools.frames import columns, estimate, physical
+from tools.traffic import CHECKS, NAMES, Checks, Traffic, Windows
 
 if TYPE_CHECKING:
     import rerun as rr
-    import rerun.blueprint as rrb
 
 MAX_CARS = 8
 
-Colour = tuple[int, int, int]
-BLUE: Colour = (86, 180, 233)
-ORANGE: Colour = (240, 160, 40)
-RED: Colour = (225, 75, 60)
-PINK: Colour = (220, 140, 180)
-GREEN: Colour = (40, 180, 130)
-YELLOW: Colour = (240, 228, 66)
-GREY: Colour = (150, 150, 150)
-VIOLET: Colour = (150, 120, 220)
-
-# A run's colour, from the first run to the last: the eye sees learning as a change of colour.
-RUN_RAMP: tuple[Colour, ...] = (VIOLET, RED, ORANGE, YELLOW)
-THIN, WIDE = 1.5, 4.0  # lines; a wide one stays visible under a thin one
-
-CAR_COLOURS: tuple[Colour, ...] = (GREY, BLUE, GREEN, YELLOW, ORANGE, RED, PINK, VIOLET)
+WIDE = 4.0  # a wide line stays visible under a thin one
+THIN = 1.5
+WINDOW_S = 1.0  # of load and silence
+LIVE_MEMORY = "1GiB"  # that the server of live viewers may keep; then it drops the oldest
 
 
 class Line(NamedTuple):
@@ -101,15 +120,15 @@ PLOTS = (
         "speed",
         "m/s",
         (
-            Line(TRAIN_SPEED, "Speed", "measured", BLUE, WIDE),
-            Line(ATP_LIMIT, "TargetSpeed", "target", PINK),
-            Line(ATP_LIMIT, "PermittedSpeed", "permitted", RED),
+            Line(TRAIN_SPEED, "Speed", "measured", MEASURED, WIDE),
+            Line(ATP_LIMIT, "TargetSpeed", "target", TARGET),
+            Line(ATP_LIMIT, "PermittedSpeed", "permitted", PERMITTED),
         ),
     ),
-    Plot("position", "m", (Line(TRAIN_POSITION, "Position", "measured", BLUE, WIDE),)),
-    Plot("acceleration", "m/s²", (Line(TRAIN_SPEED, "Acceleration", "measured", BLUE, WIDE),)),
-    Plot("force", "N", (Line(FORCE_CMD, "Force", "commanded", BLUE, WIDE),)),
-    Plot("target_distance", "m", (Line(ATP_LIMIT, "TargetDistance", "to target", PINK),)),
+    Plot("position", "m", (Line(TRAIN_POSITION, "Position", "measured", MEASURED, WIDE),)),
+    Plot("acceleration", "m/s²", (Line(TRAIN_SPEED, "Acceleration", "measured", MEASURED, WIDE),)),
+    Plot("force", "N", (Line(FORCE_CMD, "Force", "commanded", COMMANDED, WIDE),)),
+    Plot("target_distance", "m", (Line(ATP_LIMIT, "TargetDistance", "to target", TARGET),)),
     Plot("position_error", "m", (Line(ATO_TRACKING, "PositionError", "controller", BLUE),)),
     Plot("speed_error", "m/s", (Line(ATO_TRACKING, "SpeedError", "controller", BLUE),)),
     Plot(
@@ -133,24 +152,24 @@ PLOTS = (
         "neighbour_position",
         "m",
         (
-            Line(NEIGHBOUR_AHEAD_POSITION, "Position", "ahead", GREEN),
-            Line(NEIGHBOUR_BEHIND_POSITION, "Position", "behind", VIOLET),
+            Line(NEIGHBOUR_AHEAD_POSITION, "Position", "ahead", AHEAD),
+            Line(NEIGHBOUR_BEHIND_POSITION, "Position", "behind", BEHIND),
         ),
     ),
     Plot(
         "neighbour_age",
         "s",
         (
-            Line(NEIGHBOUR_AHEAD_POSITION, "Age", "ahead", GREEN),
-            Line(NEIGHBOUR_BEHIND_POSITION, "Age", "behind", VIOLET),
+            Line(NEIGHBOUR_AHEAD_POSITION, "Age", "ahead", AHEAD),
+            Line(NEIGHBOUR_BEHIND_POSITION, "Age", "behind", BEHIND),
         ),
     ),
     Plot(
         "neighbour_speed",
         "m/s",
         (
-            Line(NEIGHBOUR_AHEAD_MOTION, "Speed", "ahead", GREEN),
-            Line(NEIGHBOUR_BEHIND_MOTION, "Speed", "behind", VIOLET),
+            Line(NEIGHBOUR_AHEAD_MOTION, "Speed", "ahead", AHEAD),
+            Line(NEIGHBOUR_BEHIND_MOTION, "Speed", "behind", BEHIND),
             Line(NEIGHBOUR_AHEAD_MOTION, "OffsetSpeed", "ahead, re-based", YELLOW),
             Line(NEIGHBOUR_BEHIND_MOTION, "OffsetSpeed", "behind, re-based", PINK),
         ),
@@ -190,57 +209,17 @@ LANES = (
     Lane("emergency_brake_to_rear", ATO_RADIO, "EmergencyBrakeToRear"),
     Lane("emergency_brake_to_front", ATO_RADIO, "EmergencyBrakeToFront"),
 )
-OVERVIEW_LANES = ("mode", "supervision", "guard", "faults", "sensor")
-
-STATE_COLOURS: dict[str, Colour] = {
-    "normal": GREEN,
-    "good": GREEN,
-    "none": GREEN,
-    "running": GREEN,
-    "traction": BLUE,
-    "coast": GREY,
-    "brake": ORANGE,
-    "hold": VIOLET,
-    "warning": YELLOW,
-    "degraded": YELLOW,
-    "service_brake": ORANGE,
-    "emergency_brake": RED,
-    "emergency_request": RED,
-    "invalid": RED,
-}
-
-# Shown as bars by run, if the summary has them.
-BARS = (
-    "max_position_error_m",
-    "max_speed_error_m_s",
-    "rms_position_error_m",
-    "rms_speed_error_m_s",
-)
-
-# Curves of ATP beside the true speed: fields of the truth, their names and colours.
-CURVES: dict[str, tuple[str, Colour]] = {
-    "warning_speed_m_s": ("warning", YELLOW),
-    "service_brake_speed_m_s": ("service brake", ORANGE),
-    "emergency_brake_speed_m_s": ("emergency brake", RED),
-    "emergency_deceleration_speed_m_s": ("emergency deceleration", GREY),
-}
-
 # True errors: what is compared with the reference column of the same name.
 ERRORS = {"position_error_m": "position_m", "speed_error_m_s": "speed_m_s"}
 
-# Endings of names of quantities, longest first, and their units.
-_UNITS = (
-    ("_kwh_per_t", "kWh/t"),
-    ("_per_s", "1/s"),
-    ("_us", "µs"),
-    ("_m_s3", "m/s³"),
-    ("_m_s2", "m/s²"),
-    ("_m_s", "m/s"),
-    ("_j", "J"),
-    ("_m", "m"),
-    ("_n", "N"),
-    ("_s", "s"),
-)
+# True speeds that supervise the train, where the plant has them; they are drawn beside its own.
+SUPERVISION = {
+    "permitted_speed_m_s": PERMITTED,
+    "warning_speed_m_s": YELLOW,
+    "service_brake_speed_m_s": PINK,
+    "emergency_brake_speed_m_s": VIOLET,
+    "emergency_deceleration_speed_m_s": GREY,
+}
 
 
 class TraceError(ValueError):
@@ -275,6 +254,8 @@ class TraceWriter:
         names: Sequence[str] = (),
         trains: int = 1,
         spacing_m: float = 0.0,
+        words: Sequence[str] = (),
+        live_port: int | None = None,
     ) -> None:
         """Create the file and log the reference.
 
@@ -288,6 +269,9 @@ class TraceWriter:
         :param names: of the runs, from `first_run` on, where they are not runs of one law.
         :param trains: of the line; each method takes what concerns one of them, 0 leads.
         :param spacing_m: from the reference of a train to that of the next one.
+        :param words: names, with unit, of the words of the learning memory.
+        :param live_port: of a server on the loopback interface for viewers that look on; what they
+            do, or fail to do, does not touch the file. It serves until `end_live`.
         :raises TraceError: the file cannot be written, or `cars` is out of range.
         """
         import rerun as rr  # costs a second and 100 MB: only who writes a trace pays for it
@@ -306,45 +290,53 @@ class TraceWriter:
         self._estimates = tuple(estimates)
         self._plots = (*PLOTS, _car_force_plot(cars)) if cars else PLOTS
         self._state_names = {lane.name: _state_names(lane) for lane in LANES}
+        self._words = tuple(words)
+        self._window_ticks = max(round(WINDOW_S / period_s), 1)
+        self._period_s = period_s
         self._run: int | None = None
+        self._layout: Layout | None = None
+        self._curves: tuple[str, ...] = ()
         self._states: dict[str, int] = {}  # last value of each lane, by its entity
-        self._styled: set[str] = set()  # entities whose static style is logged
+        self._traffic: dict[int, tuple[int, Traffic, Checks]] = {}  # run and state, by train
+        self._memory: dict[int, np.ndarray] = {}  # [words, positions], by run
+        self._logged: set[str] = set()  # entities
         self._summary: list[dict[str, Any]] = []
         self._train_rows: defaultdict[int, list[dict[str, Any]]] = defaultdict(list)
+        self._frames = 0
+        self._seconds = 0.0
 
         # Equal for equal arguments, but for no two files: a viewer merges recordings of one name.
         identity = (str(path.resolve()), title, period_s, cars, estimates, first_run, last_run)
-        self._stream = rr.RecordingStream(
-            "ato-hil",
-            recording_id=hashlib.blake2b(repr(identity).encode(), digest_size=16).hexdigest(),
-        )
-        self._stream.set_log_time_enabled(False)
-        self._stream.set_log_tick_enabled(False)
-        sinks = [rr.FileSink(path)]  # a live viewer is one more
-        try:
-            self._stream.set_sinks(*sinks)
-        except RuntimeError as error:
-            raise TraceError(f"{path}: cannot write the trace: {error}") from None
-        self._stream.send_recording_name(title)
+        name = hashlib.blake2b(repr(identity).encode(), digest_size=16).hexdigest()
+        self._file = self._open(rr.FileSink(path), name, title)
+        self._streams = [self._file]
+        if live_port is not None:
+            server = rr.GrpcServerSink("127.0.0.1", live_port, server_memory_limit=LIVE_MEMORY)
+            self._streams.append(self._open(server, name, title))
+        Checks().take(RUN_CTRL, np.zeros(1, np.int64))  # compiles, or loads what was compiled
         self._log_reference("", reference)
+
+    def _open(self, sink: Any, name: str, title: str) -> rr.RecordingStream:
+        stream = self._rr.RecordingStream("ato-hil", recording_id=name)
+        stream.set_log_time_enabled(False)
+        stream.set_log_tick_enabled(False)
+        try:
+            stream.set_sinks(sink)
+        except RuntimeError as error:
+            raise TraceError(f"{self._path}: cannot write the trace: {error}") from None
+        stream.send_recording_name(title)
+        return stream
 
     def frames(self, run: int, frames: np.ndarray, train: int = 0) -> None:
         """Log FRAME rows of whole ticks; the batches of a train's run follow one another.
 
         Batches of 100 ticks and more are cheap: a batch costs some milliseconds by itself.
         """
+        started = time.perf_counter()
         found = {message.name: columns(frames, message) for message in MESSAGES}
         if self._run is None or run > self._run:
             self._run = run
-            self._stream.send_blueprint(
-                _blueprint(
-                    self._run_name(run),
-                    self._place(run, train=0),
-                    self._cars > 0,
-                    self._estimates,
-                    self._trains,
-                )
-            )
+            self._show()
         for plot in self._plots:
             ticks, values = _table(plot, found)
             names = [line.label for line in plot.lines]
@@ -360,7 +352,10 @@ class TraceWriter:
             self._log_scalars(entity, index, value[:, None], [name], [colour])
         for lane in LANES:
             self._log_lane(run, train, lane, *found[lane.message.name])
+        self._log_traffic(run, train, frames, found)
         self._log_frames(run, train, frames)
+        self._frames += len(frames)
+        self._seconds += time.perf_counter() - started
 
     def reference(self, run: int, reference: Reference) -> None:
         """Log the reference of a run on a timetable of its own; before its truth."""
@@ -371,7 +366,9 @@ class TraceWriter:
         for field in ("position_m", "speed_m_s", "acceleration_m_s2"):
             values = getattr(reference, field)[:, None]
             index = self._index(np.arange(len(values)))
-            self._log_scalars(f"reference/{field}{branch}", index, values, ["reference"], [ORANGE])
+            self._log_scalars(
+                f"reference/{field}{branch}", index, values, ["reference"], [REFERENCE]
+            )
 
     def truth(self, run: int, table: np.ndarray, train: int = 0) -> None:
         """Log the true state of the plant: a structured array of float64 fields, a row a tick.
@@ -384,14 +381,12 @@ class TraceWriter:
         label = self._run_name(run) if self._trains == 1 else f"train_{train + 1}"
         label = label.replace("_", " ")
         single = self._trains == 1
-        for field in table.dtype.names or ():
-            if np.isnan(table[field]).all():
-                continue
+        fields = [name for name in table.dtype.names or () if not np.isnan(table[name]).all()]
+        for field in fields:
             entity = self._entity(f"truth/{field}", run, train)
-            style = (["true"], [GREEN]) if single else ([label], [colour])
-            if field in CURVES:
-                name, colour_of_curve = CURVES[field]
-                style = ([name], [colour_of_curve])
+            style = (["true"], [TRUE]) if single else ([label], [colour])
+            if field in SUPERVISION:
+                style = ([field.removesuffix("_speed_m_s").replace("_", " ")], [SUPERVISION[field]])
             self._log_scalars(entity, index, table[field][:, None], *style)
         for error, field in ERRORS.items():
             if field not in (table.dtype.names or ()):
@@ -404,6 +399,34 @@ class TraceWriter:
             entity = self._entity(f"truth/{error}", run, train)
             index = self._index(np.arange(count), run)
             self._log_scalars(entity, index, values, [label], [colour])
+        if train == 0 and {"position_m", "speed_m_s"} <= set(fields):
+            # The limit is on the bus already; what else supervises the train is known here alone.
+            self._curves = tuple(name for name in list(SUPERVISION)[1:] if name in fields)
+            self._log_speed_over_position(run, table, fields)
+            self._show()
+
+    def memory(self, run: int, cells: np.ndarray, decimation: int) -> None:
+        """Log what the learning memory holds after a run.
+
+        :param cells: [cells, words] in the units of `words`; a cell is `decimation` ticks.
+        """
+        position_m = self._references.get(run, self._reference).position_m
+        middle = (np.arange(len(cells)) + 0.5) * decimation
+        at_m = position_m[np.minimum(middle, len(position_m) - 1).astype(np.int64)]
+        length_m = float(self._reference.position_m[-1])
+        over = [charts.over_position(column, at_m, length_m) for column in cells.T]
+        self._memory[run] = np.array(over)
+        # Each map is whole. One more for twice as many runs: they stay few.
+        if len(self._memory) & (len(self._memory) - 1) == 0:
+            self._log_memory()
+        self._show()
+
+    def _log_memory(self) -> None:
+        length_m = float(self._reference.position_m[-1])
+        for number in range(len(self._words)):
+            table = np.array([over[number] for over in self._memory.values()])
+            drawing = memory_map(table, length_m, list(self._memory))
+            self._log_drawing(f"memory/word_{number}", drawing)
 
     def timing(self, run: int, table: np.ndarray) -> None:
         """Log how punctual the nodes were: a row a tick, in µs; NaN where there is nothing.
@@ -419,7 +442,7 @@ class TraceWriter:
                 names = [title_of(field)]
             elif values.shape[1] > 2:
                 names[1:] = [f"controller {train + 1}" for train in range(values.shape[1] - 1)]
-            colours = [CAR_COLOURS[(1 + column) % len(CAR_COLOURS)] for column in range(len(names))]
+            colours = [apart(column) for column in range(len(names))]
             entity = f"timing/{self._run_name(run)}/{field}"
             self._log_scalars(entity, index, values, names, colours)
             histogram = pace.Histogram()
@@ -428,7 +451,8 @@ class TraceWriter:
             if counts:
                 bars = self._rr.BarChart(counts, color=BLUE)  # 0, 1, 2 to 3, 4 to 7 µs …
                 entity = f"timing/{self._run_name(run)}/octaves/{field}"
-                self._stream.log(entity, bars, static=True, strict=True)
+                self._log(entity, bars)
+        self._show()
 
     def run_summary(self, run: int, row: dict[str, Any]) -> None:
         """Log a run's row of summary.json: its numbers on timeline `run`, bars, and a table."""
@@ -447,7 +471,7 @@ class TraceWriter:
                     abscissa=[each["run"] - 0.5 for each in rows],  # of the left edge
                     color=BLUE,
                 )
-                self._stream.log(f"runs/bars/{key}", bars, static=True, strict=True)
+                self._log(f"runs/bars/{key}", bars)
         text = _markdown(self._summary)
         for each in row.get("trains", []):
             self._train_rows[run].append(
@@ -456,7 +480,7 @@ class TraceWriter:
         for number, rows in self._train_rows.items():
             text += f"\n\nTrains of run {number}\n\n" + _markdown(rows)
         document = rr.TextDocument(text, media_type="text/markdown")
-        self._stream.log("runs/table", document, static=True, strict=True)
+        self._log("runs/table", document)
 
     def text(self, run: int, tick: int, message: str, level: str = "INFO", train: int = 0) -> None:
         """Log an event; `level` is one of Rerun's: INFO, WARN, ERROR, CRITICAL."""
@@ -477,12 +501,55 @@ class TraceWriter:
 
         :raises TraceError: the disk is full, or the like.
         """
+        if len(self._memory) & (len(self._memory) - 1):
+            self._log_memory()
+        for train, (run, traffic, _checks) in self._traffic.items():
+            self._log_windows(run, train, traffic, traffic.finish())
         try:
-            self._stream.flush()
+            self._file.flush()
         except RuntimeError as error:
             raise TraceError(f"{self._path}: the trace is incomplete: {error}") from None
         finally:
-            self._stream.disconnect()
+            self._file.disconnect()
+            self._streams.remove(self._file)
+
+    @property
+    def is_live(self) -> bool:
+        """Whether viewers are served; after `close` they still are."""
+        return any(stream is not self._file for stream in self._streams)
+
+    def end_live(self) -> None:
+        """Stop serving viewers, after `close`."""
+        for stream in self._streams:
+            stream.disconnect()
+        self._streams.clear()
+
+    @property
+    def us_per_frame(self) -> float | None:
+        """Time that logging a frame has taken so far, mean, µs; None before the first."""
+        return 1e6 * self._seconds / self._frames if self._frames else None
+
+    def _show(self) -> None:
+        """Send the views of what there is, if that has changed."""
+        if self._run is None:
+            return
+        layout = Layout(
+            run=self._run_name(self._run),
+            current=self._place(self._run, train=0),
+            car_forces=self._cars > 0,
+            estimates=self._estimates,
+            trains=self._trains,
+            own_timetable=self._run in self._references,
+            length_m=float(self._reference.position_m[-1]),
+            curves=self._curves,
+            words=self._words if self._memory else (),
+            timing=any(entity.startswith("timing/") for entity in self._logged),
+        )
+        if layout != self._layout:
+            self._layout = layout
+            blueprint = of_session(layout)
+            for stream in self._streams:
+                stream.send_blueprint(blueprint)
 
     def _entity(self, name: str, run: int, train: int) -> str:
         return f"{name}/{self._place(run, train)}"
@@ -500,8 +567,8 @@ class TraceWriter:
 
     def _colour(self, run: int, train: int) -> Colour:
         if self._trains > 1:
-            return _ramp(train / (self._trains - 1))
-        return _ramp((run - self._first_run) / max(self._last_run - self._first_run, 1))
+            return ramp(train / (self._trains - 1))
+        return ramp((run - self._first_run) / max(self._last_run - self._first_run, 1))
 
     def _index(self, ticks: np.ndarray, run: int | None = None) -> list[rr.TimeColumn]:
         """Columns of the timelines for rows at these ticks."""
@@ -526,36 +593,94 @@ class TraceWriter:
         """Log a table of values (rows, lines); the first time, also how to draw its lines."""
         if len(values) == 0:
             return
-        if entity not in self._styled:
-            self._styled.add(entity)
+        if entity not in self._logged:
+            self._logged.add(entity)
             style = self._rr.SeriesLines(names=names, colors=colours, widths=widths)
-            self._stream.log(entity, style, static=True, strict=True)
+            self._log(entity, style)
         self._send(entity, index, self._rr.Scalars.columns(scalars=values))
 
     def _log_lane(
         self, run: int, train: int, lane: Lane, ticks: np.ndarray, words: np.ndarray
     ) -> None:
-        """Log where a state changes."""
-        if len(ticks) == 0:
-            return
+        """Log where a signal that is a state changes."""
         entity = self._entity("bus/state", run, train) + f"/{lane.name}"
         values = decode_column(words, getattr(lane.message, lane.signal))
+        names = self._state_names[lane.name]
+        self._log_states(entity, run, ticks, values, names, lane)
+
+    def _log_states(
+        self,
+        entity: str,
+        run: int,
+        ticks: np.ndarray,
+        values: np.ndarray,
+        names: Mapping[int, str],
+        lane: Lane | None = None,
+    ) -> None:
+        """Log where a state changes; `lane` names values that are not in `names`."""
+        if len(ticks) == 0:
+            return
         # No state is negative: the first one of a run is a change.
         changes = np.flatnonzero(np.diff(values, prepend=self._states.get(entity, -1)))
         self._states[entity] = int(values[-1])
         if len(changes) == 0:
             return
-        names = self._state_names[lane.name]
-        if entity not in self._styled:
-            self._styled.add(entity)
-            colours = [STATE_COLOURS.get(name, GREY) for name in names.values()]
+        if entity not in self._logged:
+            self._logged.add(entity)
+            colours = [STATES.get(name, GREY) for name in names.values()]
             style = self._rr.StateConfiguration(values=[*names.values()], colors=colours)
-            self._stream.log(entity, style, static=True, strict=True)
+            self._log(entity, style)
         states = [
             names.get(value) or _state_text(lane, value) for value in values[changes].tolist()
         ]
         index = self._index(ticks[changes], run)
         self._send(entity, index, self._rr.StateChange.columns(state=states))
+
+    def _log_traffic(
+        self,
+        run: int,
+        train: int,
+        frames: np.ndarray,
+        found: dict[str, tuple[np.ndarray, np.ndarray]],
+    ) -> None:
+        """Log what the messages do second by second, and how they pass their check."""
+        before = self._traffic.get(train)
+        if before is None or before[0] != run:
+            if before is not None:
+                self._log_windows(before[0], train, before[1], before[1].finish())
+            traffic = Traffic(self._window_ticks, self._period_s)
+            self._traffic[train] = before = (run, traffic, Checks())
+        _run, traffic, checks = before
+        self._log_windows(run, train, traffic, traffic.take(frames))
+        for message in MESSAGES:
+            ticks, words = found[message.name]
+            entity = self._entity("bus/end_to_end", run, train) + f"/{message.name}"
+            self._log_states(entity, run, ticks, checks.take(message, words), CHECKS)
+        if train == 0:
+            table = self._rr.TextDocument(traffic.table(checks), media_type="text/markdown")
+            self._log("bus/messages", table)
+
+    def _log_windows(self, run: int, train: int, traffic: Traffic, windows: Windows) -> None:
+        index = self._index(windows.first_ticks, run)
+        for number in np.flatnonzero(traffic.heard):
+            for kind, values in (("load", windows.load_kbit_s), ("silence", windows.silence_ms)):
+                entity = self._entity(f"bus/{kind}", run, train) + f"/{NAMES[number]}"
+                colour = apart(int(number))
+                self._log_scalars(
+                    entity, index, values[:, number : number + 1], [NAMES[number]], [colour]
+                )
+
+    def _log_speed_over_position(self, run: int, table: np.ndarray, fields: Sequence[str]) -> None:
+        reference = self._references.get(run, self._reference)
+        at = table["position_m"]
+        lines = [
+            Curve(field, at, table[field], SUPERVISION[field], THIN)
+            for field in SUPERVISION
+            if field in fields
+        ]
+        lines.append(Curve("speed_m_s", at, table["speed_m_s"], TRUE, WIDE))
+        lines.append(Curve("reference", reference.position_m, reference.speed_m_s, REFERENCE, THIN))
+        self._log_drawing("over_position/speed", curves(lines, "m/s"))
 
     def _log_frames(self, run: int, train: int, frames: np.ndarray) -> None:
         """Log the frames as they were, a row a tick."""
@@ -568,12 +693,22 @@ class TraceWriter:
         self._send(entity, self._index(ticks, run), content.partition(counts))
 
     def _send(self, entity: str, index: list[rr.TimeColumn], content: Any) -> None:
-        self._stream.send_columns(entity, index, content, strict=True)
+        for stream in self._streams:
+            stream.send_columns(entity, index, content, strict=True)
+
+    def _log(self, entity: str, content: Any) -> None:
+        """Log what holds at all times; it replaces what was there."""
+        for stream in self._streams:
+            stream.log(entity, content, static=True, strict=True)
+
+    def _log_drawing(self, entity: str, drawing: Mapping[str, Any]) -> None:
+        for name, content in drawing.items():
+            self._log(f"{entity}/{name}", content)
 
 
 def _car_force_plot(cars: int) -> Plot:
     lines = [
-        Line(CAR_FORCES[car // 2], f"Car{car + 1}", f"car {car + 1}", CAR_COLOURS[car])
+        Line(CAR_FORCES[car // 2], f"Car{car + 1}", f"car {car + 1}", APART[car])
         for car in range(cars)
     ]
     return Plot("car_force", "N", tuple(lines))
@@ -606,29 +741,10 @@ def _state_names(lane: Lane) -> dict[int, str]:
     return {0: "no", 1: "yes"} if signal.length == 1 else {0: "none"}
 
 
-def _state_text(lane: Lane, value: int) -> str:
+def _state_text(lane: Lane | None, value: int) -> str:
     """Text for a value that has no name: a set of faults, or nothing that the DBC knows."""
-    known = ", ".join(fault_names(value)) if lane.signal == "Faults" else ""
+    known = ", ".join(fault_names(value)) if lane and lane.signal == "Faults" else ""
     return known or f"{value:#x}"
-
-
-def _ramp(fraction: float) -> Colour:
-    """Colour of a run, 0 for the first and 1 for the last."""
-    place = min(max(fraction, 0.0), 1.0) * (len(RUN_RAMP) - 1)
-    below = min(int(place), len(RUN_RAMP) - 2)
-    first, second = RUN_RAMP[below], RUN_RAMP[below + 1]
-    red, green, blue = (
-        round(a + (b - a) * (place - below)) for a, b in zip(first, second, strict=True)
-    )
-    return red, green, blue
-
-
-def title_of(name: str) -> str:
-    """Name of a quantity as a person reads it: `max_speed_error_m_s` is Max speed error [m/s]."""
-    for ending, unit in _UNITS:
-        if name.endswith(ending):
-            return f"{name.removesuffix(ending).replace('_', ' ').capitalize()} [{unit}]"
-    return name.replace("_", " ").capitalize()
 
 
 def _markdown(rows: list[dict[str, Any]]) -> str:
@@ -642,132 +758,3 @@ def _markdown(rows: list[dict[str, Any]]) -> str:
         cells = (f"{row[key]:.6g}" if key in row else "" for key in keys)
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
-
-
-def _blueprint(
-    run: str, current: str, car_forces: bool, estimates: Sequence[str], trains: int
-) -> rrb.Blueprint:
-    """The views; `run` is the run in those that show one, `current` the train of it in those that
-    show one train."""
-    import rerun as rr
-    import rerun.blueprint as rrb
-
-    whole = rrb.TimeAxis(
-        view_range=rr.TimeRange(
-            start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
-        )
-    )
-
-    def plot(name: str, *entities: str, legend: bool = True) -> rrb.TimeSeriesView:
-        return rrb.TimeSeriesView(
-            name=name,
-            contents=[f"/{entity}" for entity in entities],
-            axis_x=whole,
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
-        )
-
-    def by_run(name: str, entity: str) -> rrb.TimeSeriesView:
-        return plot(name, f"{entity}/**", legend=False)  # the colours tell the runs apart
-
-    def bars(key: str) -> rrb.BarChartView:
-        return rrb.BarChartView(
-            name=f"{title_of(key)} by run",
-            origin=f"/runs/bars/{key}",
-            plot_legend=rrb.PlotLegend(visible=False),
-        )
-
-    def beside(views: Iterable[rrb.TimeSeriesView]) -> list[rrb.Container]:
-        found = list(views)
-        if not found:
-            return []
-        return [rrb.Horizontal(*found) if len(found) <= 3 else rrb.Tabs(*found)]
-
-    overview = rrb.Horizontal(
-        rrb.Vertical(
-            plot(
-                "Speed: measured blue, reference orange, permitted red, target pink [m/s]",
-                f"bus/speed/{current}",
-                "reference/speed_m_s",
-                *(f"truth/{curve}/{current}" for curve in CURVES),
-                legend=False,
-            ),
-            plot("Force by car [N]", f"bus/car_force/{current}")
-            if car_forces
-            else plot("Force [N]", f"bus/force/{current}", legend=False),
-            rrb.StateTimelineView(
-                name="States and faults",
-                origin=f"/bus/state/{current}",
-                time_view=whole,
-                contents=[f"$origin/{lane}" for lane in OVERVIEW_LANES],
-            ),
-            row_shares=[7, 5, 6],
-        ),
-        rrb.Vertical(
-            by_run("Position error, first run violet, last yellow [m]", "truth/position_error_m"),
-            by_run("Speed error, first run violet, last yellow [m/s]", "truth/speed_error_m_s"),
-            *beside(
-                by_run(f"Estimate {name}", f"bus/estimate_{number}")
-                for number, name in enumerate(estimates)
-            ),
-            rrb.Horizontal(bars("max_position_error_m"), bars("max_speed_error_m_s")),
-        ),
-        name="Overview",
-    )
-    radio = (
-        plot("Position of the neighbours [m]", f"bus/neighbour_position/{current}"),
-        plot("Speed of the neighbours [m/s]", f"bus/neighbour_speed/{current}"),
-        plot("Age of the radio data [s]", f"bus/neighbour_age/{current}"),
-        plot("Timetable against the common one [m]", f"bus/rebased_position/{current}"),
-        plot("Speed of the timetable [m/s]", f"bus/rebased_speed/{current}"),
-    )
-    signals = rrb.Grid(
-        plot("Position [m]", f"bus/position/{current}", "reference/position_m"),
-        plot(
-            "Acceleration [m/s²]",
-            f"bus/acceleration/{current}",
-            "reference/acceleration_m_s2",
-            f"truth/acceleration_m_s2/{current}",
-        ),
-        plot("Force [N]", f"bus/force/{current}", f"truth/force_n/{current}"),
-        plot(
-            "Position error [m]",
-            f"bus/position_error/{current}",
-            f"truth/position_error_m/{current}",
-        ),
-        plot("Speed error [m/s]", f"bus/speed_error/{current}", f"truth/speed_error_m_s/{current}"),
-        plot("Distance to the ATP target [m]", f"bus/target_distance/{current}"),
-        *(radio if trains > 1 else ()),
-        grid_columns=3,
-        name="Signals",
-    )
-    runs = rrb.Vertical(
-        rrb.Horizontal(*(plot(title_of(key), f"runs/{key}", legend=False) for key in BARS[:2])),
-        rrb.Horizontal(*(plot(title_of(key), f"runs/{key}", legend=False) for key in BARS[2:])),
-        rrb.TextDocumentView(name="Summary", origin="/runs/table"),
-        name="Errors by run (timeline run)",
-    )
-    log = rrb.Vertical(
-        rrb.StateTimelineView(name="All states", origin=f"/bus/state/{current}", time_view=whole),
-        rrb.TextLogView(name="Events", origin="/events"),
-        name="Events",
-    )
-    line = rrb.Horizontal(
-        by_run(
-            "Space-time diagram, leader violet, last train yellow [m]", f"truth/position_m/{run}"
-        ),
-        rrb.Vertical(
-            by_run("Separation from the train ahead [m]", f"truth/separation_m/{run}"),
-            by_run("Distance to the barrier [m]", f"truth/barrier_distance_m/{run}"),
-            by_run("Position error [m]", f"truth/position_error_m/{run}"),
-            by_run("Speed error [m/s]", f"truth/speed_error_m_s/{run}"),
-        ),
-        name="Line",
-    )
-    return rrb.Blueprint(
-        rrb.Tabs(*((line,) if trains > 1 else ()), overview, signals, runs, log),
-        rrb.TimePanel(state="collapsed", timeline="time", play_state="paused"),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        auto_views=False,
-        auto_layout=False,
-    )

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -32,6 +33,7 @@ from can_dbc.codec import (
     put,
 )
 from can_dbc.hub_server import ERROR
+from tools import live
 from tools import recorder as recorder_module
 from tools.frames import FRAME, Digest
 from tools.recorder import FIRST_ROWS, Recorder, RunsOfLine, lost_frames, save_settings
@@ -107,6 +109,9 @@ class Log:
 
     def truth(self, run: int, table: np.ndarray, train: int = 0) -> None:
         self.calls.append(("truth", run, table))
+
+    def memory(self, run: int, cells: np.ndarray, decimation: int) -> None:
+        self.calls.append(("memory", run, cells.tolist(), decimation))
 
     def run_summary(self, run: int, row: dict[str, Any]) -> None:
         self.calls.append(("summary", run, row))
@@ -282,6 +287,10 @@ def test_truth_and_summary_go_to_the_trace(events, tmp_path: Path) -> None:
     assert trace.calls[0][:2] == ("truth", 2)
     np.testing.assert_array_equal(trace.calls[0][2], table)
     assert trace.calls[1] == ("summary", 2, {"max": 1.0})
+    np.save(tmp_path / "memory.npy", np.array([[0.5, 1.0]]))
+    memory = {"run": 2, "file": str(tmp_path / "memory.npy"), "decimation": 10}
+    recorder.obey({"command": "memory", **memory})
+    assert trace.calls[2] == ("memory", 2, [[0.5, 1.0]], 10)
     Recorder().obey({"command": "summary", "run": 2, "row": {}})  # without a trace: nothing
 
 
@@ -393,10 +402,10 @@ def tell(process: subprocess.Popen[str], **command: Any) -> None:
     process.stdin.flush()
 
 
-def settings_file(path: Path) -> Path:
+def settings_file(path: Path, **more: Any) -> Path:
     ramp = np.arange(2000.0)
     reference = SimpleNamespace(position_m=ramp, speed_m_s=ramp, acceleration_m_s2=ramp)
-    save_settings(path, reference, title="test", period_s=0.01, cars=0, last_run=2)
+    save_settings(path, reference, title="test", period_s=0.01, cars=0, last_run=2, **more)
     return path
 
 
@@ -460,6 +469,27 @@ def test_every_end_keeps_a_run_that_is_under_way(start: Start, tmp_path: Path, e
     assert event["complete"] is False
     RrdReader(str(tmp_path / "trace.rrd")).store()
     assert "/bus/speed/run_01" in entities(tmp_path / "trace.rrd")
+
+
+def test_a_recorder_with_viewers_serves_them_on_after_its_trace_is_complete(
+    start: Start, tmp_path: Path
+) -> None:
+    port = live.free_port()
+    file = settings_file(tmp_path / "settings.npz", live_port=port)
+    process = start("--trace", str(file))
+    with open_bus("hub") as bus:
+        send_frames(bus, Nodes().run(1, 30))
+        tell(process, command="stop")
+        assert next_event(process)["event"] == "run"
+        traced = next_event(process)
+    assert traced["event"] == "traced"
+    assert traced["us_per_frame"] > 0
+    RrdReader(str(tmp_path / "trace.rrd")).store()
+    socket.create_connection(("127.0.0.1", port)).close()
+    assert process.poll() is None
+    assert process.stdin is not None
+    process.stdin.close()
+    assert process.wait(30) == 0
 
 
 def test_a_killed_recorder_leaves_what_it_had_logged(start: Start, tmp_path: Path) -> None:

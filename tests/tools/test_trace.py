@@ -26,8 +26,9 @@ from can_dbc.codec import (
     word_of,
 )
 from tools import trace
+from tools.blueprints import title_of
 from tools.frames import FRAME, Digest, decode, estimate
-from tools.trace import LANES, PLOTS, TraceError, TraceWriter, title_of
+from tools.trace import LANES, PLOTS, TraceError, TraceWriter
 
 TICKS = 60
 PERIOD_S = 0.01
@@ -240,7 +241,7 @@ def test_messages_that_are_not_on_the_bus_leave_no_plot(tmp_path: Path) -> None:
     entities = {
         entity.split("/")[2] for entity in Trace(tmp_path / "trace.rrd").chunks if "bus" in entity
     }
-    assert entities == {"force", "tick", "state", "frames"}
+    assert entities == {"force", "tick", "state", "frames", "load", "silence", "end_to_end"}
 
 
 def test_states_are_logged_by_name_where_they_change(tmp_path: Path) -> None:
@@ -272,7 +273,7 @@ def test_faults_are_spelled_out(tmp_path: Path) -> None:
     writer.frames(1, np.array(rows, FRAME))
     writer.close()
     states = Trace(tmp_path / "trace.rrd").column("/bus/state/run_01/faults", "StateChange:state")
-    assert states == [["none"], ["speed lost, overspeed"], ["0x8000"]]
+    assert states == [["none"], ["speed lost, overspeed"], ["too fast for the target"]]
 
 
 def test_a_state_that_the_dbc_does_not_know_is_shown_as_number(tmp_path: Path) -> None:
@@ -465,3 +466,56 @@ def test_the_trains_of_a_line_have_entities_and_references_of_their_own(tmp_path
     assert set(found.values("/truth/separation_m/run_01/train_02").ravel()) == {499.75}
     assert "/truth/separation_m/run_01/train_01" not in found.chunks
     assert found.ticks("/events/train_02") == [3]
+
+
+def test_the_memory_is_drawn_over_position_when_twice_as_many_runs_are_in_it(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "trace.rrd"
+    writer = open_writer(path, words=["theta [1]", "eta [1/s]"], cars=0, estimates=[])
+    drawn = []
+    for run in range(1, 8):
+        cells = np.column_stack((np.full(6, 0.1 * run), np.linspace(0.0, 1.0, 6)))
+        writer.frames(run, random_frames(1))
+        writer.memory(run, cells, 10)
+        drawn.append(run)
+    writer.close()
+    written = Trace(path)
+    labels = [
+        batch.column("Points2D:labels").to_pylist()[0]
+        for batch in written.static["/memory/word_0/y"]
+    ]
+    assert labels == [[f"run {run}" for run in drawn[:count]] for count in (1, 2, 4, 7)]
+    assert "/memory/word_1/map/pixels" in written.static
+
+
+def test_speed_and_what_supervises_it_are_drawn_over_position(tmp_path: Path) -> None:
+    kind = np.dtype(
+        [
+            *((name, np.float64) for name in ("position_m", "speed_m_s", "permitted_speed_m_s")),
+            *((name, np.float64) for name in ("warning_speed_m_s", "service_brake_speed_m_s")),
+        ]
+    )
+    table = np.zeros(TICKS, kind)
+    table["position_m"], table["speed_m_s"] = REFERENCE.position_m, REFERENCE.speed_m_s
+    table["permitted_speed_m_s"], table["warning_speed_m_s"] = 21.0, 22.0
+    table["service_brake_speed_m_s"] = np.nan  # of this plant there is none
+    writer = open_writer(tmp_path / "trace.rrd")
+    writer.frames(1, random_frames(1))
+    writer.truth(1, table)
+    writer.close()
+    written = Trace(tmp_path / "trace.rrd")
+    drawn = {entity.split("/")[-1] for entity in written.static if "/over_position/" in entity}
+    assert drawn >= {"permitted_speed_m_s", "warning_speed_m_s", "speed_m_s", "reference"}
+    assert "service_brake_speed_m_s" not in drawn
+    style = written.static["/truth/warning_speed_m_s/run_01"][0]
+    assert style.column("SeriesLines:names").to_pylist() == [["warning"]]
+
+
+def test_the_time_for_a_frame_is_known_after_the_first(tmp_path: Path) -> None:
+    writer = open_writer(tmp_path / "trace.rrd")
+    assert writer.us_per_frame is None
+    writer.frames(1, random_frames(3))
+    writer.close()
+    assert writer.us_per_frame is not None
+    assert writer.us_per_frame > 0
