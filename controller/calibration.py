@@ -57,7 +57,8 @@ class PlausibleSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     speed_max_m_s: float = 127.0  # either way
     speed_jump_m_s: float = 0.5  # what noise may add from one sample to the next
     acceleration_max_m_s2: float = 5.0
-    position_margin_m: float = 10_000.0  # before the start and beyond the end of the timetable
+    # Before the start and beyond the end of the timetable; none: what the sensor can say.
+    position_margin_m: float | None = None
     position_jump_m: float = 1.0  # what noise may add
     progress_max_m: float = 0.5  # of the position against the sum of the speed
     window_s: float = 2.0  # over which they are compared
@@ -226,7 +227,7 @@ def _plausibility(
     """PARAMS for a timetable that starts at `start_m` and is `distance_m` long."""
     params = np.zeros(1, plausibility.PARAMS)
     where = "control.guard.plausible."
-    margin = settings.position_margin_m
+    margin = 2.0**17 if settings.position_margin_m is None else settings.position_margin_m
     low, high = start_m - margin, start_m + distance_m + margin
     for name, key, value, q in (
         ("speed_min", "speed_max_m_s", -settings.speed_max_m_s, Q_SPEED),

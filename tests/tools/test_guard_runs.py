@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from can_dbc.codec import ATO_STATUS, FORCE_CMD
+from can_dbc.codec import ATO_STATUS, ATP_LIMIT, FORCE_CMD
+from controller.guard import ATP_SERVICE_BRAKE
 from controller.interface import GUARD_NORMAL, HOLD
-from plant_sim.scenario import Loaded, load, members
+from plant_sim.scenario import Loaded, load, members, overlaid
 from tools import setup, sil
 from tools.frames import held
 
@@ -20,7 +21,8 @@ def first_run(loaded: Loaded, law: str) -> list[sil.RunResult]:
 
 
 @pytest.mark.parametrize(
-    "scenario", ["subway-paper", "subway", "crh3", "crh3-learning", "gradient", "line"]
+    "scenario",
+    ["subway-paper", "subway", "subway-atp", "crh3", "crh3-learning", "gradient", "line"],
 )
 def test_in_a_normal_run_the_guard_does_nothing(scenario):
     loaded = load(scenario)
@@ -28,6 +30,25 @@ def test_in_a_normal_run_the_guard_does_nothing(scenario):
         assert result.faults == []
         guard = held(result.frames, loaded.ticks, ATO_STATUS, "Guard")
         assert set(guard) == {GUARD_NORMAL}
+
+
+def test_the_guard_brakes_before_atp_has_to():
+    """The authority ends before the station: with the guard's margins ATP warns, no more. On the
+    whole way they are silent."""
+    guarded = load("subway-atp:guarded").scenario.control.guard
+    (result,) = first_run(overlaid("subway-atp", {"control": {"guard": guarded}}), "cailc")
+    assert set(held(result.frames, len(result.truth), ATO_STATUS, "Guard")) == {GUARD_NORMAL}
+    stops = {}
+    for case in ("short", "guarded"):
+        loaded = load(f"subway-atp:{case}")
+        (result,) = first_run(loaded, "cailc")
+        demand = held(result.frames, loaded.ticks, ATP_LIMIT, "Supervision")
+        assert ("ATP brake demand" in result.faults) == (case == "short")
+        assert (demand.max() >= ATP_SERVICE_BRAKE) == (case == "short")
+        assert {"overspeed", "too fast for the target"} <= set(result.faults)
+        stops[case] = result.truth[-1]
+    assert abs(stops["guarded"]["speed_m_s"]) < 0.01
+    assert stops["guarded"]["position_m"] < loaded.scenario.atp.end_of_authority_m
 
 
 COMFORT = """
