@@ -1006,7 +1006,7 @@ def noise(
 
 def _print_threats(found: Campaign) -> None:
     headings = ("injected", "noticed", "not, no\neffect", "not, force\nchanged")
-    reaction = ("reaction\np50", "ticks\nmax", "bound", "over the\nlimit m/s")
+    reaction = ("reaction\np50", "ticks\nmax", "bound", "to the EBI\nm/s")
     table = Table("threat", "runs", "frames", *headings, *reaction, header_style="bold")
     for column in table.columns[1:]:
         column.justify = "right"
@@ -1017,7 +1017,7 @@ def _print_threats(found: Campaign) -> None:
             *(f"{n:,}" for n in (row.harmless, row.with_effect)),
             *("-" if n is None else f"{n:g}" for n in (row.reaction_p50, row.reaction_max)),
             "none" if row.bound is None else f"{row.bound}",
-            f"{row.overspeed_m_s:.2f}",
+            f"{row.margin_m_s:.2f}",
             style="red" if row.problems else None,
         )
     console.print(table)

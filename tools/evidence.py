@@ -40,7 +40,8 @@ class Evidence:
     def __init__(self, period_s: float) -> None:
         self.noticed: set[tuple[int, int, str]] = set()  # run, tick, message
         self.effects: set[tuple[int, int, str]] = set()
-        self.braked: dict[int, int] = {}  # by run, the first tick in which the guard brakes
+        # By run, the first tick in which the guard brakes, or the plant for want of commands.
+        self.braked: dict[int, int] = {}
         self.due = {
             message.name: round(message.cycle_ms / 1000 / period_s) for message in READ[CONTROLLER]
         }
@@ -83,8 +84,8 @@ class Evidence:
                 self.effects.add((self.run, tick, message.name))
         self._lost, self._refused[CONTROLLER] = lost, refused
         guard = int(node.state[0]["core"]["guard"])
-        if guard >= GUARD_SERVICE_BRAKE and self.run not in self.braked:
-            self.braked[self.run] = tick
+        if guard >= GUARD_SERVICE_BRAKE:
+            self.braked.setdefault(self.run, tick)
 
     def _forces_as_sent(self, side: Side, sent: list[Frame], index: int) -> list[Frame]:
         """The forces of this tick if the mailbox held what was sent."""
@@ -100,7 +101,9 @@ class Evidence:
 
     def applied(self, side: Side, tick: int, answer: list[Frame]) -> None:
         """What the plant noticed."""
-        counters = side.plant_counters.tolist()
+        if side.plant_node["command_age"] > side.plant_setting["command_age_max"]:
+            self.braked.setdefault(self.run, tick)
+        counters = side.plant_node["received"].tolist()
         refused = side.to_plant.refused.tolist()
         for message in READ[PLANT]:
             i = message.index

@@ -39,7 +39,8 @@ class Side:
     to_controller: Inbox
     to_plant: Inbox
     plant_mailboxes: np.ndarray
-    plant_counters: np.ndarray  # end-to-end counters of the last frames received
+    plant_node: Any  # state of the plant's node, and its params
+    plant_setting: Any
 
 
 class Watch(Protocol):
@@ -96,7 +97,8 @@ def run_line(
                 ),
             ),
             here.rx[train],
-            here.state["node"]["received"][train],
+            here.state[train]["node"],
+            here.params[train]["node"],
         )
         for train, node in enumerate(nodes)
     ]

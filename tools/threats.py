@@ -12,9 +12,10 @@ Two kinds of run. In the first, faults of one threat, and then of all, hit frame
   force: it has an effect. No other path leads from a fault to a force.
 
 In the second, a fault comes to stay: a message is lost, stuck, corrupt, late or foreign from some
-tick on. Measured is the time until the guard brakes, and that the train stops.
+tick on. Measured is the time until the guard brakes, or the plant for want of commands, and that
+the train stops.
 
-Through all runs the speed stays below the permitted one and the margin of an emergency brake.
+Through all runs the speed stays below that at which ATP's emergency brake intervenes.
 
 What the end-to-end protection cannot see has rows of its own, without a bound: corruption that
 keeps the CRC (`tools.residual` has its rate), and frames of a sender that knows Data-ID and
@@ -39,6 +40,7 @@ import numpy as np
 from can_dbc.codec import CAR_FORCE_1, FORCE_CMD, RUN_CTRL, TRAIN_POSITION
 from can_dbc.faults import (
     CONTROLLER,
+    PLANT,
     Babble,
     Corrupt,
     Delay,
@@ -53,7 +55,12 @@ from can_dbc.faults import (
     Stuck,
 )
 from controller.guard import reaction_ticks
-from controller.interface import FAULT_CONTROL_LOST, FAULT_SPEED_LOST
+from controller.interface import (
+    FAULT_CONTROL_LOST,
+    FAULT_LIMIT_LOST,
+    FAULT_POSITION_LOST,
+    FAULT_SPEED_LOST,
+)
 from plant_sim.scenario import Loaded, load
 from tools import session, setup
 from tools.evidence import READ, Evidence
@@ -77,16 +84,24 @@ ramps = [
     { to_m_s = "solved", start_s = 0.5, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 },
     { to_m_s = 0.0, end_s = 15.0, acceleration_m_s2 = 0.9, jerk_m_s3 = 0.5 },
 ]
+
+[atp]
+supervision = "margin"
 """
 FRAMES_A_TICK = 7  # at least, in this scenario
 NODE_OF = {message.name: node for node, messages in READ.items() for message in messages}
 NAMES = tuple(NODE_OF)
 SENSED = ("ATP_LIMIT", "TRAIN_SPEED", "TRAIN_POSITION")  # in every tick
+LOSSES = {
+    "ATP_LIMIT": FAULT_LIMIT_LOST,
+    "TRAIN_SPEED": FAULT_SPEED_LOST,
+    "TRAIN_POSITION": FAULT_POSITION_LOST,
+    "RUN_CTRL": FAULT_CONTROL_LOST,
+}
 PROBABILITY = 0.02  # that a fault hits a frame
 FIRST_TICK = 20  # of a fault: the run has begun
 STAYS_FROM_TICK = 305  # in full traction
 NOTICE_TICKS = 1  # from a fault to its notice
-EMERGENCY_MARGIN_M_S = 2 / 3.6  # above the permitted speed, CTCS
 STOPPED_M_S = 0.01
 
 
@@ -96,6 +111,7 @@ class Threat(msgspec.Struct, frozen=True):
     name: str
     rules: tuple[Any, ...]
     stays: bool = False  # it comes to stay
+    fault: int = 0  # which makes the guard brake then; 0: the plant brakes for want of commands
     visible: bool = True  # the end-to-end protection can see it
 
 
@@ -120,7 +136,7 @@ class Row(msgspec.Struct):
     reaction_p50: float | None = None  # ticks until it is noticed, or the guard brakes
     reaction_max: int | None = None
     bound: int | None = None
-    overspeed_m_s: float = -np.inf  # largest speed above the permitted one
+    margin_m_s: float = np.inf  # least distance to the speed of an emergency brake intervention
     problems: list[str] = []
 
 
@@ -225,24 +241,28 @@ def threats() -> list[Threat]:
 
 def _that_stay() -> Iterator[Threat]:
     when: dict[str, Any] = {"from_tick": STAYS_FROM_TICK, "at": CONTROLLER}
-    for name in (*SENSED, RUN_CTRL.name):
+    for name, fault in LOSSES.items():
         only: dict[str, Any] = {"messages": (name,), **when}
-        yield Threat(f"deletion of {name}", (Drop(**only),), True)
-        yield Threat(f"repetition of {name}", (Stuck(**only),), True)
-        yield Threat(f"corruption of {name}", (Corrupt(bits=2, **only),), True)
-        yield Threat(f"masquerade of {name}", (Masquerade(**only),), True)
+        yield Threat(f"deletion of {name}", (Drop(**only),), True, fault)
+        yield Threat(f"repetition of {name}", (Stuck(**only),), True, fault)
+        yield Threat(f"corruption of {name}", (Corrupt(bits=2, **only),), True, fault)
+        yield Threat(f"masquerade of {name}", (Masquerade(**only),), True, fault)
     for name in SENSED:
-        yield Threat(f"delay of {name}", (Delay(ticks=30, messages=(name,), **when),), True)
-    yield Threat("silence of the plant", (Silence(node="PLANT", **when),), True)
-    yield Threat("a babbling node", (Babble(id=0, **when),), True)
+        late = Delay(ticks=30, messages=(name,), **when)
+        yield Threat(f"delay of {name}", (late,), True, LOSSES[name])
+    yield Threat("silence of the plant", (Silence(node="PLANT", **when),), True, FAULT_SPEED_LOST)
+    yield Threat("a babbling node", (Babble(id=0, **when),), True, FAULT_SPEED_LOST)
+    mute = Silence(node="CONTROLLER", from_tick=STAYS_FROM_TICK, at=PLANT)
+    yield Threat("silence of the controller", (mute,), True)
 
 
 def _invisible() -> Iterator[Threat]:
     often: dict[str, Any] = {"messages": NAMES, "from_tick": FIRST_TICK}
-    yield Threat("corruption of 8 bits", (Corrupt(bits=8, probability=0.1, **often),), False, False)
+    eight = Corrupt(bits=8, probability=0.1, **often)
+    yield Threat("corruption of 8 bits", (eight,), visible=False)
     for name in (*SENSED, CAR_FORCE_1.name):
         knowing = Masquerade(messages=(name,), source=name, from_tick=STAYS_FROM_TICK)
-        yield Threat(f"Data-ID of {name} known", (knowing,), True, False)
+        yield Threat(f"Data-ID of {name} known", (knowing,), stays=True, visible=False)
 
 
 def numbered(listed: list[Threat], frames: int, ticks: int) -> list[Numbered]:
@@ -285,6 +305,7 @@ def in_process(
     """All runs in one process: the campaign with a row for each threat, and all injected faults."""
     nodes = setup.controllers_for([loaded], loaded.scenario.law)
     bounds = reaction_ticks(nodes[0].params[0]["guard"])
+    command_age_max = loaded.scenario.atp.command_age_max_ticks
     evidence = Evidence(loaded.scenario.period_s)
     digest = LineDigest(1)
     by_run = {run: each for each in listed for run in each.runs}
@@ -301,15 +322,14 @@ def in_process(
         events += result.injected
         row.runs += 1
         row.frames += len(result.frames)
-        over = result.truth["speed_m_s"] - result.truth["permitted_speed_m_s"]
-        row.overspeed_m_s = max(row.overspeed_m_s, float(over.max()))
+        margin = result.truth["emergency_brake_speed_m_s"] - result.truth["speed_m_s"]
+        row.margin_m_s = min(row.margin_m_s, float(margin.min()))
         if result.cut:
             row.problems.append(result.cut)
         noticed = _judge(row, each, result, evidence)
         if each.threat.stays:
             _judge_reaction(row, each.threat, result, evidence, reactions[row.threat])
-            slow = RUN_CTRL.name in row.threat
-            row.bound = bounds[FAULT_CONTROL_LOST if slow else FAULT_SPEED_LOST]
+            row.bound = bounds.get(each.threat.fault, command_age_max + 1)
         else:
             row.bound = NOTICE_TICKS
             reactions[row.threat] += noticed
@@ -349,12 +369,12 @@ def _judge(row: Row, each: Numbered, result: RunResult, evidence: Evidence) -> l
 def _judge_reaction(
     row: Row, threat: Threat, result: RunResult, evidence: Evidence, reactions: list[int]
 ) -> None:
-    """Of a fault that comes to stay: that the guard brakes, and that the train stops."""
+    """Of a fault that comes to stay: when the train is braked, and that it stops."""
     braked = evidence.braked.get(result.run)
     if braked is not None:
         reactions.append(braked - result.injected[0].tick)
     elif threat.visible:
-        row.problems.append("the guard did not brake")
+        row.problems.append("nobody braked")
     speed_m_s = float(result.truth["speed_m_s"][-1])
     if threat.visible and abs(speed_m_s) > STOPPED_M_S:
         row.problems.append(f"at the end the train runs at {speed_m_s:.2f} m/s")
@@ -374,5 +394,5 @@ def _conclude(row: Row, threat: Threat, reactions: list[int]) -> None:
         row.problems.append(f"{row.with_effect} faults that nobody noticed changed a force")
     if row.bound is not None and row.reaction_max is not None and row.reaction_max > row.bound:
         row.problems.append(f"reaction after {row.reaction_max} ticks, expected {row.bound}")
-    if row.overspeed_m_s > EMERGENCY_MARGIN_M_S:
-        row.problems.append(f"{row.overspeed_m_s:.2f} m/s above the permitted speed")
+    if row.margin_m_s < 0:
+        row.problems.append(f"{-row.margin_m_s:.2f} m/s above the speed of an emergency brake")

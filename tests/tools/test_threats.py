@@ -146,12 +146,12 @@ def test_a_second_frame_counts_from_when_it_comes() -> None:
     [
         ({"with_effect": 2}, "2 faults that nobody noticed changed a force"),
         ({"injected": 0}, "nothing was injected"),
-        ({"overspeed_m_s": 0.6}, "0.60 m/s above the permitted speed"),
+        ({"margin_m_s": -0.6}, "0.60 m/s above the speed of an emergency brake"),
         ({"bound": 3}, "reaction after 4 ticks, expected 3"),
     ],
 )
 def test_what_is_not_as_it_must_be_is_a_problem(change: dict, problem: str) -> None:
-    good: dict[str, Any] = {"injected": 5, "bound": 4, "overspeed_m_s": -0.2}
+    good: dict[str, Any] = {"injected": 5, "bound": 4, "margin_m_s": 0.2}
     row = Row("t", problems=[], **{**good, **change})
     threats._conclude(row, Threat("t", ()), [1, 4])
     assert row.problems == [problem]
