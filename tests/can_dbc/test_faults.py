@@ -22,7 +22,16 @@ from can_dbc.codec import (
     TRAIN_POSITION,
     TRAIN_SPEED,
 )
-from can_dbc.faults import CONTROLLER, PLANT, Event, FaultError, Frame, Plan, Receiver
+from can_dbc.faults import (
+    CONTROLLER,
+    PLANT,
+    Event,
+    FaultError,
+    Frame,
+    Plan,
+    Planned,
+    Receiver,
+)
 
 SENSED = (ATP_LIMIT, TRAIN_SPEED, TRAIN_POSITION)  # what the plant sends in each tick
 PERIOD_S = 0.01
@@ -392,3 +401,30 @@ def test_a_wrong_file_is_refused_with_one_line(tmp_path: Path, text: str, says: 
 def test_a_missing_file_is_refused_with_one_line(tmp_path: Path) -> None:
     with pytest.raises(FaultError, match=r"none\.toml: cannot be read: No such file"):
         faults.load(tmp_path / "none.toml", 1, PERIOD_S)
+
+
+def test_what_fails_inside_a_node_is_logged_when_it_begins(tmp_path: Path) -> None:
+    log: list[Event] = []
+    planned = [Planned((), 2, "speed", "stuck", 1), Planned((2,), 0, "wheel", "slip", 2)]
+    receiver = Receiver(plan("", tmp_path), PLANT, 0, log.append, planned)
+    for run in (1, 2):
+        assert listen(receiver, 4, run=run) == sent(4)
+    assert [(e.run, e.tick, e.message, e.kind) for e in log] == [
+        (1, 2, "speed", "stuck"),
+        (2, 0, "wheel", "slip"),
+        (2, 2, "speed", "stuck"),
+    ]
+
+
+def test_signals_to_processes(tmp_path: Path) -> None:
+    file = tmp_path / "faults.toml"
+    file.write_text(
+        '[[process]]\nnode = "a"\nsignal = "SIGKILL"\nat_s = 1.234\n'
+        '[[process]]\nnode = "b"\nsignal = "SIGSTOP"\nat_s = 0\nrun = 3\n'
+    )
+    assert faults.load_signals(file, ["a", "b"], PERIOD_S) == [
+        (1, 124, "a", "SIGKILL", 1),
+        (3, 0, "b", "SIGSTOP", 2),
+    ]
+    with pytest.raises(FaultError, match=r"key process\[1\]: node is 'b', expected one of a$"):
+        faults.load_signals(file, ["a"], PERIOD_S)

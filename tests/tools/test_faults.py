@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from tools import session
+from tools.hil import RunError
 
 FAULTS = """
 [[bus]]
@@ -123,32 +124,42 @@ def test_faults_change_the_run_and_no_faults_do_not(ato_hil, short: Path, tmp_pa
     assert digests[0] == digests[1] != digests[2]
 
 
-@pytest.mark.parametrize("mode", ["sil", pytest.param("hil", marks=pytest.mark.long)])
-def test_a_run_that_cannot_begin_ends_with_its_cause(
-    ato_hil, short: Path, tmp_path: Path, mode: str
-) -> None:
-    """A controller that never hears of the start stays silent."""
-    (tmp_path / "faults.toml").write_text(
-        '[[bus]]\nkind = "drop"\nmessages = ["RUN_CTRL"]\nto_tick = 1\n'
-    )
-    bus = ("--bus", f"hub:{tmp_path.name[-20:]}") if mode == "hil" else ()
-    options = ("run", str(short), "--mode", mode, *bus, "--faults", "faults.toml", "--out", "o")
-    done = ato_hil(*options, cwd=tmp_path)
-    assert done.returncode == 3
-    cause = "controller is silent: no FORCE_CMD for tick 0 of run 1"
-    assert f"ato-hil: {cause}" in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
-    summary = json.loads((tmp_path / "o" / "summary.json").read_text())
-    assert summary["ended_early"].startswith(cause)
+CUT = '[[bus]]\nkind = "drop"\nmessages = ["RUN_CTRL"]\nto_tick = 1\n'
+CAUSE = "controller is silent: no FORCE_CMD for tick 0 of run 1"
+
+
+def check_cut(folder: Path) -> None:
+    """What a controller that never hears of the start leaves: it stays silent."""
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["ended_early"].startswith(CAUSE)
+    assert summary["runs"] == []
     assert summary["faults_injected"] == {"drop": 1}
-    assert (tmp_path / "o" / "faults.csv").read_text().splitlines()[1:] == [
+    assert (folder / "faults.csv").read_text().splitlines()[1:] == [
         "1,0,1,controller,RUN_CTRL,drop,0,1"
     ]
-    assert (tmp_path / "o" / "trace.rrd").stat().st_size > 0
+    assert (folder / "trace.rrd").stat().st_size > 0
+
+
+def test_a_run_that_cannot_begin_ends_with_its_cause(short: Path, tmp_path: Path) -> None:
+    with pytest.raises(RunError) as ended:
+        session.run(asked(short, tmp_path, CUT), Nobody())
+    assert str(ended.value) == CAUSE
+    check_cut(tmp_path / "o")
+
+
+@pytest.mark.long
+def test_on_a_bus_it_ends_with_the_same_cause(ato_hil, short: Path, tmp_path: Path) -> None:
+    (tmp_path / "faults.toml").write_text(CUT)
+    options = ("--bus", f"hub:{tmp_path.name[-20:]}", "--faults", "faults.toml", "--out", "o")
+    done = ato_hil("run", str(short), *options, cwd=tmp_path)
+    assert done.returncode == 3
+    assert f"ato-hil: {CAUSE}" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    check_cut(tmp_path / "o")
 
 
 class Nobody:
-    """Watches a session that does not begin."""
+    """Watches a session without a word."""
 
     def begin(self, *_: Any) -> None: ...
     def note(self, text: str) -> None: ...
