@@ -142,7 +142,12 @@ def _start(server: Server, path: Path) -> None:
                 stderr=subprocess.PIPE,
                 start_new_session=True,
                 check=False,
+                timeout=CONNECT_TIMEOUT_S,
             )
+        except subprocess.TimeoutExpired as error:
+            path.unlink(missing_ok=True)
+            reason = f"it does not begin to serve within {CONNECT_TIMEOUT_S:g} s"
+            raise can.CanInitializationError(f"{failure}: {reason}") from error
         except OSError as error:
             path.unlink(missing_ok=True)
             raise can.CanInitializationError(f"{failure}: {error}") from error

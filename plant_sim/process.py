@@ -425,6 +425,7 @@ def warm_up(here: world.World) -> None:
     here.actuate_and_advance(here.params, here.track, here.state, chance, 0, here.rx, truth)
     plant.announce(here.state[0]["node"], plant.IDLE, 0, here.tx[0])
     plant.confirmed(here.state[0]["node"], here.rx[0])
+    intact(FORCE_CMD, 0)
     here.tx["fresh"][:] = 0
 
 

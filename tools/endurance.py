@@ -41,6 +41,7 @@ MOMENTS_S = 8.0  # a signal comes at most so long after its process
 START_S = 300.0  # the first session compiles
 END_S = 60.0  # longest from the signal to the end of the session
 LINGER_S = 5.0  # the hub ends by itself
+ANOTHER_HUB_S = 10.0  # until the nodes have one again
 RUNS = 4000  # more than a trial ever comes to
 
 MARK = "ATO_HIL_TRIAL"
@@ -152,16 +153,15 @@ def attempt(trial: Trial, folder: Path) -> Outcome:
             text=True,
         )
         try:
-            struck = _strike(trial, session, mark)
-            begun_s = time.monotonic()
-            complaints = [] if struck else [f"no {trial.victim} to strike"]
+            struck_s = _strike(trial, session, mark)
+            complaints = [f"no {trial.victim} to strike"] if struck_s is None else []
             try:
                 _out, said = session.communicate(timeout=END_S)
             except subprocess.TimeoutExpired:
                 session.kill()
                 _out, said = session.communicate()
                 complaints.append(f"it did not end within {END_S:g} s")
-            seconds = time.monotonic() - begun_s
+            seconds = time.monotonic() - (struck_s or time.monotonic())
             complaints += _processes_left(mark)
         finally:
             for process in _processes(mark):
@@ -171,26 +171,35 @@ def attempt(trial: Trial, folder: Path) -> Outcome:
         left = [path for path in Path(temporary).rglob("*") if not path.is_dir()]
         if left:
             complaints.append(f"{left[0].relative_to(temporary)} and {len(left) - 1} more are left")
-    cause = " ".join(said.split()).removeprefix("ato-hil: ")
+    cause = said.strip().rpartition("\n")[2].removeprefix("ato-hil: ")
     complaints += _complaints(trial, folder, session.returncode, said)
     return Outcome(trial, seconds, cause, tuple(complaints))
 
 
-def _strike(trial: Trial, session: subprocess.Popen[str], mark: str) -> bool:
-    """Waits for the victim and the moment, and sends the signal; whether there was a victim."""
-    moment_s = None
+def _strike(trial: Trial, session: subprocess.Popen[str], mark: str) -> float | None:
+    """Waits for the victim and the moment, and sends the signal; when that was, None if there was
+    no victim.
+
+    A hub that nobody uses yet is not missed: for a while, those that follow it are struck as well.
+    """
+    moment_s = last_s = None
+    struck: set[int] = set()
     deadline_s = time.monotonic() + START_S
     while session.poll() is None and time.monotonic() < deadline_s:
         found = _processes(mark, VICTIMS[trial.victim])
+        now_s = time.monotonic()
         if found and moment_s is None:
-            moment_s = time.monotonic() + trial.delay_s
-        if found and moment_s is not None and time.monotonic() >= moment_s:
-            # It may be another one by now: the first hub is there to see if the bus is in use.
-            with suppress(ProcessLookupError):
-                os.kill(found[-1], trial.signal)
-                return True
+            moment_s = now_s + trial.delay_s
+        if moment_s is not None and now_s >= moment_s:
+            for process in set(found) - struck:
+                with suppress(ProcessLookupError):
+                    os.kill(process, trial.signal)
+                    struck.add(process)
+                    last_s = now_s
+        if last_s is not None and (trial.victim != "hub" or now_s > last_s + ANOTHER_HUB_S):
+            break
         time.sleep(0.01)
-    return False
+    return last_s
 
 
 def _processes(mark: str, word: str = "") -> list[int]:

@@ -1,6 +1,11 @@
 """Sessions by the clock: what is counted, what is said of it, and one over the bus."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +14,7 @@ from rerun.chunk import RrdReader
 
 from can_dbc import pace
 from can_dbc.codec import FORCE_CMD, TRAIN_POSITION, TRAIN_SPEED, put
-from tools import realtime
-from tools.endurance import SCENARIO
+from tools import endurance, realtime
 from tools.frames import ticks_by_echo
 from tools.session import Options, SessionError, run
 
@@ -30,7 +34,15 @@ CONTROLLER = timing_of([10, 20, 7_000, 30], [-1] * 4)
 # What is counted.
 
 
-def test_misses_and_missing_commands_are_counted_over_the_runs():
+@pytest.fixture
+def stolen(monkeypatch):
+    """What the host takes, as the kernel tells it, one figure after the other."""
+    figures = [0.0, 0.0]
+    monkeypatch.setattr(realtime, "stolen_s", lambda: figures.pop(0) if figures else 0.0)
+    return figures
+
+
+def test_misses_and_missing_commands_are_counted_over_the_runs(stolen):
     account = realtime.Account(10_000, 0)
     of_nodes = {"plant": PLANT, "controller": CONTROLLER}
     assert account.add(of_nodes) == {"deadline_misses": 2, "missing_commands": 1}
@@ -54,6 +66,17 @@ def test_misses_and_missing_commands_are_counted_over_the_runs():
         *("controller: wake-up after the deadline", "controller: step"),
     ]
     json.dumps(found)
+
+
+def test_what_the_host_takes_is_said(stolen):
+    stolen[:] = [100.0, 102.5]
+    found = realtime.Account(10_000, 0).summary()
+    assert found["stolen_s"] == 2.5
+    assert realtime.verdict(found).endswith("; the host took 2.5 s")
+
+
+def test_what_the_host_takes_is_read_where_the_kernel_tells_it():
+    assert realtime.stolen_s() >= 0.0
 
 
 def test_a_session_that_ended_before_its_first_run_has_an_account():
@@ -128,7 +151,7 @@ class Listener:
 
 def options(folder, **more):
     scenario = folder / "short.toml"
-    scenario.write_text(SCENARIO)
+    scenario.write_text(endurance.SCENARIO)
     return Options(
         **{
             **{"scenario": str(scenario), "law": None, "runs": 1, "mode": "hil", "seed": 1},
@@ -177,3 +200,34 @@ def test_a_session_by_the_clock(tmp_path: Path):
             rows[entity] = rows.get(entity, 0) + chunk.num_rows
     names = ("latency_us", "jitter_us", "step_us")
     assert rows == {f"/timing/run_01/{name}": 301 for name in names}
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="Linux only")
+def test_a_controller_that_stands_still_for_a_while_ends_no_run(short_text, tmp_path: Path):
+    """The vehicle brakes by itself, stands, and the run goes on to its end."""
+    (tmp_path / "short.toml").write_text(short_text)
+    arguments = ["run", "short.toml", "--runs", "1", "--pace", "realtime"]
+    arguments += ["--bus", f"hub:{tmp_path.name[-20:]}", "--out", "out"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tools.cli", *arguments],
+        cwd=tmp_path,
+        env={**os.environ, endurance.MARK: "of-this-test"},
+        stdout=subprocess.DEVNULL,
+    )
+    # The recorder logs the first ten of the run's twenty seconds when they are over.
+    trace = tmp_path / "out" / "trace.rrd"
+    while not trace.exists() or trace.stat().st_size < 100_000:
+        assert process.poll() is None
+        time.sleep(0.1)
+    (controller,) = endurance._processes("of-this-test", "controller.process")
+    os.kill(controller, signal.SIGSTOP)
+    time.sleep(0.7)
+    os.kill(controller, signal.SIGCONT)
+    assert process.wait(120) == 0
+    found = json.loads((tmp_path / "out" / "summary.json").read_text())
+    (row,) = found["runs"]
+    assert row["ticks"] == 2001
+    assert row["missing_commands"] >= 50
+    assert "ATP brake demand" in row["faults"]
+    assert row["stop_error_m"] < -1.0  # it stands where the brake has left it
