@@ -37,6 +37,12 @@ added, which passes before a crossing is seen. The gradient is the most downhill
 train; the resistance of the train does not count. Left out: curves for limits over time, release
 speed, guidance curve, indication.
 
+What holds, then, whatever the controller does: the train stops before the supervised location, and
+is nowhere above that location's EBD. At a ceiling, and near a lower static speed, the emergency
+brake comes at V_MRSP + dV_ebi, as the standard has it: traction that is still on takes the train
+above that by V_delta1 + V_delta2 at most. The service brake's curves have the train at constant
+speed until the brake is full: traction can take it past the end of authority, into the overlap.
+
 Release: warning and service brake at or below the permitted speed, the emergency brake at
 standstill; a brake stays where nothing is permitted.
 

@@ -304,6 +304,24 @@ def test_truth_and_its_errors_against_the_reference(tmp_path: Path) -> None:
         assert logged.tolist() == getattr(REFERENCE, field).tolist()
 
 
+def test_the_curves_of_atp_have_names_and_those_that_limit_nothing_are_left_out(
+    tmp_path: Path,
+) -> None:
+    names = ("speed_m_s", "warning_speed_m_s", "emergency_brake_speed_m_s")
+    table = np.zeros(TICKS, np.dtype([(name, np.float64) for name in names]))
+    table["emergency_brake_speed_m_s"] = np.nan
+    writer = open_writer(tmp_path / "trace.rrd")
+    writer.truth(1, table)
+    writer.close()
+    written = Trace(tmp_path / "trace.rrd")
+    labels = {
+        name: written.static[f"/truth/{name}/run_01"][0].column("SeriesLines:names").to_pylist()
+        for name in names[:2]
+    }
+    assert labels == {"speed_m_s": [["true"]], "warning_speed_m_s": [["warning"]]}
+    assert f"/truth/{names[2]}/run_01" not in written.static
+
+
 def test_a_run_on_its_own_timetable_has_its_own_reference(tmp_path: Path) -> None:
     """Its errors are against that; those of the other runs against the planned one."""
     own = SimpleNamespace(**{name: 1.5 * column for name, column in vars(REFERENCE).items()})
