@@ -37,6 +37,7 @@ table { border-collapse: collapse; font-size: .8rem; }
 th, td { padding: .2rem .55rem; text-align: right; border-bottom: 1px solid #e4e4e4;
   vertical-align: top; }
 th { font-weight: 600; }
+.wide td { white-space: nowrap; }
 td:first-child, th:first-child, .plain td, .plain th { text-align: left; }
 .plain td { font-family: ui-monospace, monospace; overflow-wrap: anywhere; }
 figure { margin: 1rem 0; display: inline-block; vertical-align: top; }

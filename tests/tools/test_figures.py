@@ -318,7 +318,7 @@ def test_one_run_gives_no_learning_curve_and_no_trace_no_speeds(tmp_path: Path) 
         each.drawing.number: each.why_not for each in draw.figures([read(tmp_path / "one")])
     }
     assert by_number[2] == "", "the track needs no trace"
-    assert by_number[6].endswith("one has 1 runs, it takes two and more")
+    assert by_number[6].endswith("one has fewer than two completed runs")
     assert by_number[3].endswith("one has no trace.rrd")
 
 

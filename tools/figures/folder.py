@@ -100,7 +100,7 @@ class Folder:
         """
         rows = [row for row in self.rows if row["run"] >= first and row.get(key) is not None]
         if len(rows) < 2:
-            raise Missing(f"{self.label} has {len(rows)} runs, it takes two and more")
+            raise Missing(f"{self.label} has fewer than two completed runs")
         return np.array([row["run"] for row in rows]), np.array([float(row[key]) for row in rows])
 
     def learning_runs(self) -> list[int]:
