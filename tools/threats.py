@@ -6,6 +6,8 @@ Two kinds of run. In the first, faults of one threat, and then of all, hit frame
 - Noticed: in the tick in which a fault acts, or in the next, the receiver's own state of that
   message says that something is wrong: a frame was refused or was one too many in the tick (link
   counter, inbox), the counter jumped, or nothing came when it was due (age).
+  A delay that lasts is noticed when it begins: the frames after that come late, but in sequence.
+  How late they may be is bounded by the age that a message may have.
 - Effect: a frame that the receiver accepts, without noticing, is not the one that was sent. At the
   controller the whole tick is then computed again from the state before, with the frame as sent:
   the fault has an effect if a force that it sends differs. At the plant the accepted frame is a
@@ -346,6 +348,7 @@ def _judge(row: Row, each: Numbered, result: RunResult, evidence: Evidence) -> l
     """Fault by fault until the guard brakes: noticed, or with an effect. The ticks until the notice
     of those that are noticed."""
     noticed = []
+    late = set()  # message and number of frames whose delay was noticed
     end = evidence.braked.get(result.run, len(result.truth)) if each.threat.stays else np.inf
     for event in result.injected:
         rule = each.threat.rules[event.rule - each.first_rule]
@@ -356,6 +359,11 @@ def _judge(row: Row, each: Numbered, result: RunResult, evidence: Evidence) -> l
         soon = [(event.run, acts + n, message) for n in range(NOTICE_TICKS + 1)]
         row.injected += 1
         when = [n for n, place in enumerate(soon) if place in evidence.noticed]
+        if isinstance(rule, Delay):
+            if (message, event.n - 1) in late:
+                when = when or [0]
+            if when:
+                late.add((message, event.n))
         if when:
             row.noticed += 1
             noticed.append(when[0])

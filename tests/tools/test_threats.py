@@ -141,6 +141,16 @@ def test_a_second_frame_counts_from_when_it_comes() -> None:
     assert (row.noticed, reactions) == (1, [0])
 
 
+def test_a_delay_that_lasts_is_noticed_when_it_begins() -> None:
+    """Frames 7 to 9 are late; after the gap of tick 7 they come in sequence."""
+    row, _ = judged(faults.Delay(ticks=1), noticed=(7,), effects=(8, 9), ticks=(7, 8, 9))
+    assert (row.noticed, row.with_effect) == (3, 0)
+    row, _ = judged(faults.Delay(ticks=1), effects=(7, 8, 9), ticks=(7, 8, 9))
+    assert (row.noticed, row.with_effect) == (0, 3)
+    row, _ = judged(Corrupt(), noticed=(6,), effects=(8,), ticks=(6, 8))
+    assert (row.noticed, row.with_effect) == (1, 1)
+
+
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
