@@ -97,16 +97,15 @@ docs: $(RUN_READY) ## write docs/messages.md and docs/command-line.md again, fro
 	.venv/bin/python -m tools.docs
 # The viewer draws them without a screen, with Vulkan in software: mesa-vulkan-drivers is for this.
 pictures: $(RUN_READY) ## draw the screenshots of the viewer in docs/ again
-	.venv/bin/ato-hil run subway --mode sil --runs 5 --out runs/pictures/cailc
-	for law in cailc pdilc; do
-		.venv/bin/ato-hil run subway-paper --law $$law --mode sil --runs 8 --out "runs/pictures/paper-$$law"
+	for law in cailc ailc; do
+		.venv/bin/ato-hil run subway --law "$$law" --mode sil --runs 5 --out "runs/pictures/$$law"
 	done
 	.venv/bin/ato-hil run line --mode sil --runs 1 --out runs/pictures/line
 	.venv/bin/ato-hil view runs/pictures/cailc --screenshot docs/trace.png
 	.venv/bin/ato-hil view runs/pictures/cailc --tab learning --screenshot docs/trace-learning.png
 	.venv/bin/ato-hil view runs/pictures/cailc --tab bus --screenshot docs/trace-bus.png
 	.venv/bin/ato-hil view runs/pictures/line --screenshot docs/trace-line.png
-	.venv/bin/ato-hil view --law-compare runs/pictures/paper-cailc runs/pictures/paper-pdilc \
+	.venv/bin/ato-hil view --law-compare runs/pictures/cailc runs/pictures/ailc \
 		--screenshot docs/trace-compare.png
 
 lint: $(DEV_READY) ## ruff: lint and format
