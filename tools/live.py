@@ -57,6 +57,10 @@ class LiveView:
         self._viewer, text = show(self._kind, [_url(self.port)])
         with suppress(OSError):  # it has ended, or priorities are not ours to change
             os.setpriority(os.PRIO_PROCESS, self._viewer.pid, NICE)
+            # Linux shares the processors among sessions first, and the viewer has one of its own.
+            group = Path(f"/proc/{self._viewer.pid}/autogroup")
+            if group.exists():
+                group.write_text(str(NICE))
         return text
 
     def when_closed(self, callback: Callable[[], object]) -> None:
