@@ -17,6 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol
 
+import can
 import msgspec
 import numpy as np
 
@@ -559,12 +560,17 @@ def _record_the_rest(session: Session, kept: Path) -> None:
 
 
 def _refuse_busy_bus(name: str, listen_s: float) -> None:
-    """Two sessions on one bus would answer each other."""
-    with open_bus(name) as bus:
-        if recv_frames(bus, listen_s):
-            raise SessionError(
-                f"bus {name!r} carries other traffic; choose another, e.g. --bus hub:second"
-            )
+    """Two sessions on one bus would answer each other. Raises SessionError, or RunError if the bus
+    ends meanwhile."""
+    try:
+        with open_bus(name) as bus:
+            busy = bool(recv_frames(bus, listen_s))
+    except can.CanError as error:
+        raise RunError(f"bus {name} is gone: {error}") from None
+    if busy:
+        raise SessionError(
+            f"bus {name!r} carries other traffic; choose another, e.g. --bus hub:second"
+        )
 
 
 def _on_event(

@@ -14,10 +14,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import can
 import pytest
 from rerun.chunk import RrdReader
 
+from tools import session
 from tools.cli import Mode, Screen
+from tools.hil import RunError
 from tools.replay import prepare, replay
 from tools.session import Options, SessionError, run
 
@@ -349,6 +352,16 @@ def test_what_ends_a_run_early_is_named_and_leaves_nothing_behind(
         assert again.returncode == 0, again.stderr
         assert "missing" not in again.stdout
         assert "commands as recorded" in again.stdout.splitlines()[-1]
+
+
+def test_a_bus_that_ends_while_it_is_listened_to_is_named(tmp_path: Path, monkeypatch) -> None:
+    def gone(bus, timeout_s):
+        raise can.CanOperationError("the hub (process 7) is gone")
+
+    monkeypatch.setattr(session, "recv_frames", gone)
+    name = channel(tmp_path)
+    with pytest.raises(RunError, match=f"^bus {name} is gone: the hub .process 7. is gone$"):
+        session._refuse_busy_bus(name, 0.01)
 
 
 def test_two_sessions_do_not_share_a_bus(ato_hil, tmp_path: Path) -> None:
