@@ -992,13 +992,13 @@ def noise(
     console.print(f"expected to be taken {found.expected_taken:.2g} frames")
     console.print(f"random words         {direct.words:,}, half of them protected")
     console.print(f"largest force        {direct.largest_command:.3f} commanded,", end=" ")
-    console.print(f"{direct.largest_force:.3f} applied, of what the train can give")
+    console.print(f"{direct.largest_traction:.3f} of traction, of what the train can give")
     problems = []
     if found.frames < frames:
         problems.append(f"{found.frames} random frames were sent, expected {frames}")
     if found.changed:
         problems.append(f"{found.changed} ticks are not as without noise")
-    if max(direct.largest_command, direct.largest_force) > 1:
+    if max(direct.largest_command, direct.largest_traction) > 1:
         problems.append("a force is larger than the train can give")
     if problems:
         raise _fail("; ".join(problems), EXIT_BAD_INPUT)

@@ -2,7 +2,8 @@
 
 Half of the words are noise, half are protected as the message asks for and carry random values, so
 that what stands behind the end-to-end check is reached too. The state is kept running whatever the
-words say. Nothing may crash, and no force may leave what actuators can give.
+words say. Nothing may crash, and neither the command nor the traction may be more than the train
+can give.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
     words: int
     largest_command: float  # of the largest that the train can give; at most 1
-    largest_force: float  # of the actuators, likewise; infinite if a number of the plant is
+    largest_traction: float  # of the actuators, likewise; infinite if a number of the plant is
 
 
 @step
@@ -81,8 +82,9 @@ def build_firmware_loop(tick: Any) -> Any:
 
 
 def build_plant_loop(actuate_and_advance: Any) -> Any:
-    """Loop of the plant on random words; returns the largest force of the actuators, N, infinite if
-    any number of the plant is not finite."""
+    """Loop of the plant on random words; returns the largest traction of the actuators, N, infinite
+    if any number of the plant is not finite. Safety brakes come on top of commanded ones, so that
+    braking has no such bound."""
 
     @step
     def loop(
@@ -104,7 +106,7 @@ def build_plant_loop(actuate_and_advance: Any) -> Any:
             random = fill(rx[0], counters, random)
             actuate_and_advance(params, track, state, chance, int64(0), rx, truth)
             now = truth[0, 0]
-            largest = max(largest, abs(now.force_n))
+            largest = max(largest, now.force_n)
             if not np.isfinite(now.position_m + now.speed_m_s + now.force_n):
                 largest = np.inf
         return largest

@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
-from math import ceil
+from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -31,6 +31,7 @@ from plant_sim.scenario import load
 from tools import hil, setup, sil
 from tools.evidence import READ
 from tools.observer import PLANT
+from tools.session import RUNS_MAX
 
 BURST = 400  # frames in a tick
 RECEIVE_TIMEOUT_S = 0.1
@@ -165,15 +166,15 @@ def beside(
     """
     loaded = load(scenario)
     calibration = setup.calibration_for(loaded, loaded.scenario.law)
-    runs = range(1, 1 + ceil(1.2 * frames / BURST / loaded.ticks))
-    progress("without noise ...")
-    quiet = [result.truth for result, _ in sil.run(loaded, calibration, runs=runs, seed=seed)]
+    runs = range(1, RUNS_MAX + 1)  # it ends when the noise does
+    quiet = sil.run(loaded, calibration, runs=runs, seed=seed)
     name = choose_bus(bus).name
     noise = ["tools.noise", "--bus", name, "--frames", str(frames), "--seed", str(seed)]
-    ticks = changed = 0
+    done = ticks = changed = 0
+    kinds: dict[str, int] = {}
     with TemporaryDirectory(prefix="ato-hil-") as folder:
         kept = Path(folder)
-        for node, event, bench in hil.run(
+        events = hil.run(
             scenario=loaded.source,
             controllers=[calibration],
             buses=[name],
@@ -183,17 +184,22 @@ def beside(
             memory_file=None,
             recorder_arguments=["--out", str(kept)],
             others={"noise": noise},
-        ):
-            if node.name == PLANT and event["event"] == "run":
-                (truth,) = np.load(event["file"])
-                ticks += len(truth)
-                changed += differing_rows(truth, quiet[event["run"] - runs[0]])
-                progress(f"run {event['run']} of {runs[-1]}")
-            kinds = bench.nodes["noise"].said.get("done", {}).get("kinds", {})
+        )
+        with closing(events):
+            for node, event, bench in events:
+                if node.name == PLANT and event["event"] == "run":
+                    (truth,) = np.load(event["file"])
+                    result, _ = next(quiet)
+                    done, ticks = done + 1, ticks + len(truth)
+                    changed += differing_rows(truth, result.truth)
+                    progress(f"run {event['run']} with noise")
+                    kinds = bench.nodes["noise"].said.get("done", {}).get("kinds", {})
+                    if kinds:
+                        break
     identifiers = sum(len(messages) for messages in READ.values())
     sent = sum(kinds.values())
     expected = sent * SHARE_OF_MAILBOX_FRAMES * identifiers / 2048 * TAKEN
-    return Outcome(sent, dict(sorted(kinds.items())), len(runs), ticks, changed, expected)
+    return Outcome(sent, dict(sorted(kinds.items())), done, ticks, changed, expected)
 
 
 if __name__ == "__main__":
