@@ -963,6 +963,7 @@ def noise(
     scenario: Annotated[
         str, typer.Argument(help="Name of a scenario or a .toml file; of one train.")
     ] = "subway",
+    law: Annotated[str, typer.Option(help="One that does not learn.")] = "pid",
     frames: Annotated[int, typer.Option(min=1, help="Random frames to send.")] = 1_000_000,
     words: Annotated[
         int, typer.Option(min=1, help="Random words into mailboxes, without a bus.")
@@ -978,7 +979,7 @@ def noise(
 
     try:
         with one_line_for_bad_input(), console.status("compiling ...") as status:
-            found = flood.beside(scenario, frames, seed, bus, status.update)
+            found = flood.beside(scenario, law, frames, seed, bus, status.update)
             status.update("random words ...")
             direct = fuzz.run(scenario, words, seed)
     except RunError as error:
@@ -989,6 +990,7 @@ def noise(
     console.print(f"random frames sent   {found.frames:,} ({kinds})", soft_wrap=True)
     console.print(f"beside               {found.runs} runs, {found.ticks:,} ticks")
     console.print(f"ticks changed        {found.changed}")
+    console.print(f"runs with a fault    {found.stopped} ({', '.join(found.faults) or 'none'})")
     console.print(f"expected to be taken {found.expected_taken:.2g} frames")
     console.print(f"random words         {direct.words:,}, half of them protected")
     console.print(f"largest force        {direct.largest_command:.3f} commanded,", end=" ")

@@ -2,9 +2,12 @@
 and error frames. They may crash nothing and change no force.
 
 The noise is a node of its own (`python -m tools.noise`). It sends a burst after each
-TRAIN_POSITION: as much as nodes that answer every tick can read, on any bus. The run is then
-compared with the same run without noise: the true motion and force of the train, tick by tick, bit
-by bit.
+TRAIN_POSITION, as much as the wire has room for. The run is then compared with the same run without
+noise: the true motion and force of the train, tick by tick, bit by bit. The law is one that does
+not learn, so that no run depends on the one before.
+
+Noise may be noticed: where the identifier of RUN_CTRL comes more often in noise than its link
+tolerates, the guard reports run control as lost and brakes. Such runs are counted by themselves.
 
 A random frame is taken for good if it is a standard data frame of 8 bytes with the identifier of a
 message that a node reads, and its CRC, Data-ID nibble and counter are right. `expected_taken` says
@@ -27,13 +30,15 @@ import numpy as np
 from can_dbc.bus import BusError, choose_bus, open_bus, recv_frames
 from can_dbc.child import Stop, follow_parent, tell
 from can_dbc.codec import TRAIN_POSITION
+from can_dbc.faults import WIRE_FRAMES
+from controller.interface import FAULTS, fault_names
 from plant_sim.scenario import load
 from tools import hil, setup, sil
 from tools.evidence import READ
 from tools.observer import PLANT
 from tools.session import RUNS_MAX
 
-BURST = 400  # frames in a tick
+BURST = WIRE_FRAMES - 8  # frames in a tick: what 500 kbit/s have room for beside the run's own
 RECEIVE_TIMEOUT_S = 0.1
 SEND_TIMEOUT_S = 1.0
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
@@ -50,7 +55,9 @@ class Outcome(msgspec.Struct):
     kinds: dict[str, int]
     runs: int
     ticks: int
-    changed: int  # ticks in which force or motion of the train is another
+    changed: int  # ticks in which force or motion is another, in runs without a reported fault
+    stopped: int  # runs with a reported fault
+    faults: list[str]  # those faults
     expected_taken: float  # random frames that a node takes for good
 
 
@@ -157,20 +164,20 @@ def differing_rows(one: np.ndarray, other: np.ndarray) -> int:
 
 
 def beside(
-    scenario: str, frames: int, seed: int, bus: str, progress: Callable[[str], None]
+    scenario: str, law: str, frames: int, seed: int, bus: str, progress: Callable[[str], None]
 ) -> Outcome:
-    """Runs the scenario with its default law in one process, then on the bus with noise beside it,
-    until `frames` random frames are sent; compares what the train did.
+    """Runs the scenario with a law in one process, and on the bus with noise beside it, until
+    `frames` random frames are sent; compares what the train did.
 
     :raises RunError: a node dies or falls silent.
     """
     loaded = load(scenario)
-    calibration = setup.calibration_for(loaded, loaded.scenario.law)
+    calibration = setup.calibration_for(loaded, law)
     runs = range(1, RUNS_MAX + 1)  # it ends when the noise does
     quiet = sil.run(loaded, calibration, runs=runs, seed=seed)
     name = choose_bus(bus).name
     noise = ["tools.noise", "--bus", name, "--frames", str(frames), "--seed", str(seed)]
-    done = ticks = changed = 0
+    done = ticks = changed = stopped = faults = 0
     kinds: dict[str, int] = {}
     with TemporaryDirectory(prefix="ato-hil-") as folder:
         kept = Path(folder)
@@ -191,7 +198,11 @@ def beside(
                     (truth,) = np.load(event["file"])
                     result, _ = next(quiet)
                     done, ticks = done + 1, ticks + len(truth)
-                    changed += differing_rows(truth, result.truth)
+                    reported = event["faults"][0] & ~_faults_of(result)
+                    if reported:
+                        stopped, faults = stopped + 1, faults | reported
+                    else:
+                        changed += differing_rows(truth, result.truth)
                     progress(f"run {event['run']} with noise")
                     kinds = bench.nodes["noise"].said.get("done", {}).get("kinds", {})
                     if kinds:
@@ -199,7 +210,14 @@ def beside(
     identifiers = sum(len(messages) for messages in READ.values())
     sent = sum(kinds.values())
     expected = sent * SHARE_OF_MAILBOX_FRAMES * identifiers / 2048 * TAKEN
-    return Outcome(sent, dict(sorted(kinds.items())), done, ticks, changed, expected)
+    sorted_kinds = dict(sorted(kinds.items()))
+    names = fault_names(faults)
+    return Outcome(sent, sorted_kinds, done, ticks, changed, stopped, names, expected)
+
+
+def _faults_of(result: sil.RunResult) -> int:
+    """The fault bits of a run without noise."""
+    return sum(bit for bit, name in FAULTS.items() if name in result.faults)
 
 
 if __name__ == "__main__":
