@@ -944,7 +944,11 @@ def threats(
         raise _fail("threats: mode is mil, expected sil or hil", EXIT_BAD_INPUT)
     least = frames or (1_000_000 if mode is Mode.sil else 100_000)
     try:
-        with one_line_for_bad_input(), console.status("compiling ...") as status:
+        with (
+            one_line_for_bad_input(),
+            _sigterm_as_ctrl_c(),
+            console.status("compiling ...") as status,
+        ):
             rates = residual.measure(RESIDUAL_FRAMES, seed)
             found = campaign.run(least, mode.value, bus, seed, out, status.update)
     except RunError as error:
@@ -978,7 +982,11 @@ def noise(
     from tools.hil import RunError
 
     try:
-        with one_line_for_bad_input(), console.status("compiling ...") as status:
+        with (
+            one_line_for_bad_input(),
+            _sigterm_as_ctrl_c(),
+            console.status("compiling ...") as status,
+        ):
             found = flood.beside(scenario, law, frames, seed, bus, status.update)
             status.update("random words ...")
             direct = fuzz.run(scenario, words, seed)
@@ -1090,7 +1098,12 @@ def endurance(
     from tools import files
 
     done = []
-    with one_line_for_bad_input(), console.status("") as status:
+    with (
+        one_line_for_bad_input(),
+        _sigterm_as_ctrl_c(),
+        console.status("") as status,
+        suppress(KeyboardInterrupt),  # what was done counts
+    ):
         for outcome in trials.campaign(trials.plan(times, seed), out):
             done.append(outcome)
             status.update(f"{len(done)} of {times} sessions; last: {outcome.cause}")
@@ -1112,7 +1125,9 @@ def endurance(
     console.print(table)
     failed = sum(bool(each.complaints) for each in done)
     if failed:
-        raise _fail(f"{failed} of {times} sessions did not end as demanded", EXIT_BAD_INPUT)
+        raise _fail(f"{failed} of {len(done)} sessions did not end as demanded", EXIT_BAD_INPUT)
+    if len(done) < times:
+        raise _fail(f"interrupted after {len(done)} of {times} sessions", EXIT_INTERRUPTED)
 
 
 def main() -> None:

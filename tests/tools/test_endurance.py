@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from controller import store
 from plant_sim.scenario import load
 from tools import endurance
+from tools.cli import app
 from tools.setup import calibration_for
 
 
@@ -125,6 +127,20 @@ def test_processes_of_a_trial_are_found_by_their_mark(monkeypatch):
         assert endurance._processes("of-this-test", "another-word") == []
         assert endurance._processes("of-another-test") == []
     assert endurance._processes("of-this-test") == []
+
+
+def test_a_campaign_that_is_interrupted_counts_what_was_done(tmp_path, monkeypatch):
+    def interrupted(trials, out):
+        out.mkdir()
+        yield endurance.Outcome(trials[0], 1.0, "the controller process ended (signal 9)", ())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(endurance, "campaign", interrupted)
+    out = tmp_path / "out"
+    result = CliRunner().invoke(app, ["endurance", "--times", "5", "--out", str(out)])
+    assert result.exit_code == 130
+    assert result.stderr == "ato-hil: interrupted after 1 of 5 sessions\n"
+    assert len(json.loads((out / "endurance.json").read_text())["trials"]) == 1
 
 
 @pytest.mark.long
