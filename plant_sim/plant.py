@@ -261,6 +261,12 @@ def read_cars(node: Any, rx: Any, first: Any, message: Any, one: Any, other: Any
 
 
 @step
+def fault_brakes(params: Any, tick: Any) -> Any:
+    """Whether a fault of the scenario brakes."""
+    return tick >= params.brake_from and tick < params.brake_to
+
+
+@step
 def order_brakes(params: Any, state: Any) -> None:
     """What ATP, the controller's mode and the age of the command ask of the safety brakes."""
     node = state.node
@@ -273,7 +279,9 @@ def order_brakes(params: Any, state: Any) -> None:
     lost = node.command_age > params.node.command_age_max
     holds = node.mode == HOLD and stands
     service = state.atp.service != 0 or lost or holds
-    emergency = state.atp.emergency != 0 or node.emergency_requested != 0
+    # A brake of the scenario's own is the one that is requested.
+    requested = node.emergency_requested != 0 and not fault_brakes(params.node, int64(node.tick))
+    emergency = state.atp.emergency != 0 or requested
     brakes.order(
         state.brakes,
         atp.cuts_traction(params.atp, state.atp),
@@ -288,7 +296,7 @@ def fail(params: Any, node: Any, train: Any) -> None:
     tick = int64(node.tick)
     if tick >= params.weak_from and tick < params.weak_to:
         node.command_n[0] = min(node.command_n[0], params.weak_force_n)
-    if tick >= params.brake_from and tick < params.brake_to:
+    if fault_brakes(params, tick):
         force = -params.mass_kg * params.brake_m_s2
         if train.speed_m_s > 0.0:  # the train's resistance brakes as well
             force += train.force_n - params.mass_kg * train.acceleration_m_s2
@@ -298,7 +306,7 @@ def fail(params: Any, node: Any, train: Any) -> None:
 @step
 def demand(params: Any, state: Any, tick: Any) -> Any:
     """What ATP demands, or the scenario's fault says that it does."""
-    if tick >= params.brake_from and tick < params.brake_to:
+    if fault_brakes(params, tick):
         return max(int64(params.brake_supervision), int64(state.atp.demand))
     return int64(state.atp.demand)
 

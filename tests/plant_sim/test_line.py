@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from can_dbc.codec import ATP_LIMIT, get
-from plant_sim import plant, world
+from plant_sim import atp, plant, world
 from plant_sim.profile import POSITION_UNIT_M
 from plant_sim.scenario import ScenarioError, load, members
 
@@ -156,6 +156,7 @@ class Drive:
             words = here.tx["payload"][:, ATP_LIMIT.index].tolist()
             self.supervision.append([get(word, ATP_LIMIT.Supervision) for word in words])
             here.state["node"]["command_n"][:, 0] = 200e3 * force_m_s2
+            here.state["node"]["command_age"] = 0
             here.actuate_and_advance(
                 here.params, here.track, here.state, self.chance, self.tick, here.rx, self.truth
             )
@@ -200,7 +201,7 @@ def test_an_emergency_brake_is_said_by_atp(line):
     said = np.array(drive.supervision)
     assert not said[:, 0].any()
     assert np.flatnonzero(said[:, 1]).tolist() == list(range(100, 150))
-    assert set(said[100:150, 1]) == {plant.EMERGENCY_BRAKE}
+    assert set(said[100:150, 1]) == {atp.EMERGENCY_BRAKE}
 
 
 def test_a_train_that_is_held_starts_with_the_force_that_holds_it(line):

@@ -500,8 +500,9 @@ def test_the_memory_is_drawn_over_position_when_twice_as_many_runs_are_in_it(
     writer.close()
     written = Trace(path)
     labels = [
-        batch.column("Points2D:labels").to_pylist()[0]
+        row
         for batch in written.static["/memory/word_0/y"]
+        for row in batch.column("Points2D:labels").to_pylist()
     ]
     assert labels == [[f"run {run}" for run in drawn[:count]] for count in (1, 2, 4, 7)]
     assert "/memory/word_1/map/pixels" in written.static
