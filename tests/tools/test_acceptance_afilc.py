@@ -144,6 +144,7 @@ def test_the_first_runs_learn_as_fast_as_the_spec_s():
     assert runs["faults"].sum() == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("u_0", U_0)
 def test_the_baseline_exceeds_the_speed_limit_and_gets_lost(u_0):
     """Run 1 plays u_0, run 2 the first learned input: 398 km/h above the profile."""
@@ -154,6 +155,7 @@ def test_the_baseline_exceeds_the_speed_limit_and_gets_lost(u_0):
         assert runs[POSITION].max() / runs[POSITION][0] > 3  # 11.8
 
 
+@pytest.mark.long
 def test_the_guard_holds_the_baseline():
     """Traction is cut 2 km/h above the limit; downhill the train still gains speed: 110 km/h."""
     text = "[control.guard]\noverspeed_margin_m_s = 0.5555555556\n"

@@ -103,6 +103,7 @@ def _entities(trace: Path) -> set[str]:
     return {chunk.entity_path for chunk in RrdReader(str(trace)).stream()}
 
 
+@pytest.mark.long
 def test_the_interpreted_line_gives_the_bits_of_the_compiled_one(ato_hil, tmp_path: Path) -> None:
     name = short(tmp_path, trains=2, duration_s=6.0)
     digests = []

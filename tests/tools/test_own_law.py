@@ -32,6 +32,7 @@ def summary(ato_hil: Any, folder: Path, scenario: str, mode: str) -> dict:
     return json.loads(file.read_text(encoding="utf-8"))
 
 
+@pytest.mark.long
 def test_the_law_follows_the_profile_with_its_gains_and_without(ato_hil, folder):
     mine, plain = (summary(ato_hil, folder, name, "sil") for name in ("mine.toml", "plain.toml"))
     assert max(run["max_position_error_m"] for run in mine["runs"]) < 0.2
