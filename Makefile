@@ -28,7 +28,7 @@ hil: $(RUN_READY) ## set up and run the main job: SCENARIO=subway RUNS=10, trace
 	.venv/bin/ato-hil run "$(SCENARIO)" --mode hil --runs "$(RUNS)" --out "runs/$(SCENARIO)"
 	echo
 	echo "Trace: runs/$(SCENARIO)/trace.rrd"
-	echo "Open:  .venv/bin/rerun runs/$(SCENARIO)/trace.rrd"
+	echo "Open:  .venv/bin/ato-hil view runs/$(SCENARIO)"
 
 test: $(DEV_READY) ## set up and pass the fast tests
 	.venv/bin/python -m pytest -n 2 -q -m "not long and not pil and not uml" $(PYTEST_ARGS)
