@@ -95,6 +95,7 @@ claims: $(RUN_READY) ## measure what the papers claim again, and write it into d
 
 docs: $(RUN_READY) ## write docs/messages.md and docs/command-line.md again, from DBC and program
 	.venv/bin/python -m tools.docs
+
 # The viewer draws them without a screen, with Vulkan in software: mesa-vulkan-drivers is for this.
 pictures: $(RUN_READY) ## draw the screenshots of the viewer in docs/ again
 	for law in cailc ailc; do

@@ -1,4 +1,4 @@
-"""The way from the bus into a node's mailboxes.
+"""The way between the bus and a node's mailboxes.
 
 A mailbox holds one frame. Of two frames of one message in the same tick, the one that follows in
 sequence stays, and the other is counted as refused: neither noise nor a repeated or foreign frame
@@ -14,6 +14,15 @@ import numpy as np
 from can_dbc import e2e
 from can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGE_COUNT, MESSAGES
 from can_dbc.faults import Receiver
+
+
+def fresh_frames(mailboxes: np.ndarray) -> list[tuple[int, int]]:
+    """What waits in mailboxes to be sent, in sending order; they are stale then."""
+    fresh = mailboxes["fresh"]
+    words = mailboxes["payload"].tolist()
+    frames = [(MESSAGES[i].frame_id, words[i]) for i in fresh.nonzero()[0].tolist()]
+    fresh.fill(0)
+    return frames
 
 
 def intact(message: Any, payload: int) -> bool:

@@ -27,9 +27,9 @@ import numpy as np
 from can_dbc import pace
 from can_dbc.bus import BusError, open_bus, recv_frames, send_frames
 from can_dbc.child import Stop, follow_parent, tell
-from can_dbc.codec import MESSAGES, RUN_CTRL, TRAIN_POSITION, get
+from can_dbc.codec import RUN_CTRL, TRAIN_POSITION, get
 from can_dbc.faults import CONTROLLER, Receiver, receiver
-from can_dbc.inbox import Inbox, intact
+from can_dbc.inbox import Inbox, fresh_frames, intact
 from controller import calibration, node, store
 from controller.interface import ARMED, ENDED, RUNNING
 from controller.quantise import CalibrationError
@@ -39,7 +39,6 @@ RECEIVE_TIMEOUT_S = 0.1
 DRIFT = 10_000  # two clocks drift apart by less than a period in so many
 CATCH_UP_MAX = 100  # periods computed at once
 TICKS_HALF = 1 << 15  # TRAIN_POSITION.Tick has 16 bits
-FRAME_IDS = [message.frame_id for message in MESSAGES]
 
 Frame = tuple[int, int]  # identifier and payload, as can_dbc.bus moves them
 
@@ -70,10 +69,7 @@ def answers(
 
 def to_send(controller: node.Controller) -> Iterator[list[Frame]]:
     """The controller's fresh mailboxes, which are then empty; nothing if they are."""
-    fresh = controller.tx["fresh"]
-    words = controller.tx["payload"].tolist()
-    sent = [(FRAME_IDS[i], words[i]) for i in fresh.nonzero()[0].tolist()]
-    fresh.fill(0)
+    sent = fresh_frames(controller.tx)
     if sent:
         yield sent
 

@@ -28,13 +28,12 @@ import numpy as np
 from can_dbc import pace
 from can_dbc.bus import BusError, open_bus, recv_frames, send_frames
 from can_dbc.child import Stop, follow_parent, tell
-from can_dbc.codec import ATO_STATUS, FORCE_CMD, MESSAGES, get
+from can_dbc.codec import ATO_STATUS, FORCE_CMD, get
 from can_dbc.faults import PLANT, receiver
-from can_dbc.inbox import Inbox, intact
+from can_dbc.inbox import Inbox, fresh_frames, intact
 from plant_sim import failures, plant, world
 from plant_sim.scenario import ScenarioError, load
 
-FRAME_IDS = [message.frame_id for message in MESSAGES]
 TICK_START = FORCE_CMD.Tick.start
 REPEAT_S = 0.1  # RUN_CTRL outside a run
 EARLY_NS = 2_000_000  # before a deadline: the wait for frames may last that much too long
@@ -56,11 +55,7 @@ def controller_name(here: world.World, train: int) -> str:
 
 def post(here: world.World, train: int, bus: can.BusABC) -> None:
     """Sends a train's fresh mailboxes and empties them."""
-    fresh = here.tx["fresh"][train]
-    words = here.tx["payload"][train].tolist()
-    frames = [(FRAME_IDS[i], words[i]) for i in fresh.nonzero()[0].tolist()]
-    fresh.fill(0)
-    send_frames(bus, frames)
+    send_frames(bus, fresh_frames(here.tx[train]))
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from plant_sim.scenario import Loaded
     from tools.bus_report import Report as BusReport
     from tools.residual import Rate
+    from tools.session import Options
     from tools.threats import Campaign
     from tools.verify import Row
 
@@ -294,22 +295,49 @@ def run(
         # them.
         environment = {**os.environ, "ATO_HIL_INTERPRETED": "1"}
         os.execve(sys.executable, [sys.executable, "-m", "tools.cli", *sys.argv[1:]], environment)
-    with one_line_for_bad_input():
+    with one_line_for_bad_input(), _sigterm_as_ctrl_c(), ExitStack() as stack:
+        from tools.session import Options
+
         nodes = tuple(dict.fromkeys(node.value for node in external or ()))
-        with ExitStack() as stack:
-            stack.enter_context(_sigterm_as_ctrl_c())
-            viewer = None
-            if view is not None:
-                if not trace:
-                    raise _fail("--view shows the trace, so not with --no-trace", EXIT_BAD_INPUT)
-                viewer = stack.enter_context(LiveView(view.value))
-            _run(
-                *(scenario, law, runs, mode, bus, seed, out, memory, trace, record, nodes),
+        viewer = None
+        if view is not None:
+            if not trace:
+                raise _fail("--view shows the trace, so not with --no-trace", EXIT_BAD_INPUT)
+            viewer = stack.enter_context(LiveView(view.value))
+        _run(
+            Options(
+                scenario=scenario,
+                law=law,
+                runs=runs,
+                mode=mode.value,
+                bus=bus,
+                seed=seed,
+                out=out or _folder(scenario, law, mode, nodes),
+                memory=memory,
+                trace=trace,
+                record=record,
+                external=nodes,
                 faults=faults,
                 pace=pace.value,
                 spin_us=spin_us,
                 viewer=viewer,
-            )
+            ),
+            Screen(mode),
+        )
+
+
+def _folder(scenario: str, law: str | None, mode: Mode, external: tuple[str, ...]) -> Path:
+    """Where a session leaves its files if nobody says."""
+    from controller.registry import law_label
+    from plant_sim.scenario import load
+    from tools.session import EXTERNAL_LAW
+
+    loaded = load(scenario)
+    if External.controller in external:
+        name = EXTERNAL_LAW
+    else:
+        name = law_label(law or loaded.scenario.law)
+    return Path("runs") / f"{loaded.folder_name}-{name}-{mode.value}"
 
 
 @contextmanager
@@ -324,72 +352,45 @@ def one_line_for_bad_input() -> Iterator[None]:
         raise _fail(str(error), EXIT_BAD_INPUT) from None
 
 
-def _run(
-    scenario: str,
-    law: str | None,
-    runs: int | None,
-    mode: Mode,
-    bus: str,
-    seed: int,
-    out: Path | None,
-    memory: Path | None,
-    trace: bool,
-    record: Path | None,
-    external: tuple[str, ...],
-    faults: Path | None,
-    viewer: LiveView | None,
-    **more: Any,
-) -> None:
-    from controller.registry import law_label
-    from plant_sim.scenario import load
+def _run(options: Options, screen: Screen) -> None:
     from tools import session
     from tools.hil import RunError
 
-    loaded = load(scenario)
-    if External.controller in external:
-        name = session.EXTERNAL_LAW
-    else:
-        name = law_label(law or loaded.scenario.law)
-    folder = out or Path("runs") / f"{loaded.folder_name}-{name}-{mode.value}"
-    options = session.Options(
-        *(scenario, law, runs, mode.value, bus, seed, folder, memory, trace, record, external),
-        faults=faults,
-        viewer=viewer,
-        **more,
-    )
-    screen = Screen(mode)
+    folder = options.out
     try:
         with screen.bar:
             summary = session.run(options, screen)
     except RunError as error:
         _print_table(screen)
         failure = _fail(f"{error}; the runs so far are in {folder}", EXIT_ENDED_EARLY)
-        _wait_for(viewer)
+        _wait_for(options.viewer)
         raise failure from None
     except KeyboardInterrupt:
         _print_table(screen)
         raise _fail(f"interrupted; the runs so far are in {folder}", EXIT_INTERRUPTED) from None
     _print_table(screen)
-    if External.plant in external:
+    if External.plant in options.external:
         console.print("errors and energy are what the bus shows: measured, commanded")
     if "timing" in summary:
         _print_timing(summary["timing"])
     repeats = "" if summary["digest_repeats"] else "   (in real time another one each time)"
     console.print(f"digest  {summary['digest']}{repeats}")
     console.print(f"summary {folder / 'summary.json'}", soft_wrap=True)
-    if trace:
+    if options.trace:
         trace_file = folder / "trace.rrd"
         cost = summary["trace"]
         size = f"{cost['bytes'] / 1e6:.1f} MB, {cost['us_per_frame']:.2f} µs a frame"
         console.print(f"trace   {trace_file}   {size}", soft_wrap=True)
         console.print(f"        (open it with: ato-hil view {folder})", soft_wrap=True)
-    if faults is not None:
+    if options.faults is not None:
         injected = ", ".join(f"{n} {kind}" for kind, n in summary["faults_injected"].items())
         log = folder / "faults.csv"
         console.print(f"faults  {log}   (injected: {injected or 'none'})", soft_wrap=True)
-    if record is not None:
-        console.print(f"record  {record}   (again: ato-hil replay {record})", soft_wrap=True)
-    _wait_for(viewer)
+    if options.record is not None:
+        console.print(
+            f"record  {options.record}   (again: ato-hil replay {options.record})", soft_wrap=True
+        )
+    _wait_for(options.viewer)
 
 
 @contextmanager

@@ -106,6 +106,7 @@ class Session:
     loaded: Loaded
     members: list[Loaded]  # the scenario of each train
     law: str
+    calibrations: list[Calibration]  # of each controller; none of an external one
     runs: range
     listener: Listener
     summary: dict[str, Any] = field(default_factory=dict)
@@ -140,7 +141,7 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         asked = _faults(options, options.faults, loaded)
     prepare(options.out)
     listener.begin(loaded, law, runs)
-    session = Session(options, loaded, trains, law, runs, listener, faults=asked)
+    session = Session(options, loaded, trains, law, calibrations, runs, listener, faults=asked)
     if calibrations:
         session.words = _words(options, law, calibrations)
     session.summary = {
@@ -166,9 +167,9 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
         session.summary["faults_injected"] = {}
     try:
         if options.mode == "hil":
-            _run_hil(session, calibrations)
+            _run_hil(session)
         else:
-            _run_in_process(session, calibrations)
+            _run_in_process(session)
     except RunError as error:
         session.summary["ended_early"] = str(error)
         raise
@@ -338,8 +339,8 @@ def _set_digest(session: Session, digest: str, of_trains: list[str]) -> None:
         session.summary["digests"] = of_trains
 
 
-def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
-    options = session.options
+def _run_in_process(session: Session) -> None:
+    options, calibrations = session.options, session.calibrations
     digest = LineDigest(len(calibrations))
     nodes = [node.build(calibration, options.memory) for calibration in calibrations]
     session.summary["controller"] = {
@@ -376,7 +377,7 @@ def _run_in_process(session: Session, calibrations: list[Calibration]) -> None:
                 if session.words:
                     generation = int(nodes[0].state[0]["memory"]["generation"])
                     cells = nodes[0].cells[generation]
-                    writer.memory(run, *_learned(session, calibrations[0], cells))
+                    writer.memory(run, *_learned(session, cells))
             if results[0].cut:
                 raise RunError(results[0].cut)
             row = _finish_run(session, run, frames, truths, seconds, latched)
@@ -429,12 +430,10 @@ def _look_on(session: Session, when_closed: Callable[[], object]) -> None:
         session.listener.note(viewer.start())
 
 
-def _learned(
-    session: Session, calibration: Calibration, cells: np.ndarray
-) -> tuple[np.ndarray, int]:
+def _learned(session: Session, cells: np.ndarray) -> tuple[np.ndarray, int]:
     """What the cells of the learning memory hold in the units of its words, and the ticks of a
     cell."""
-    memory = calibration.params[0]["memory"]
+    memory = session.calibrations[0].params[0]["memory"]
     scale = [float(memory["scale"]) / 2.0**q for _name, _unit, q in load_law(session.law).WORDS]
     return cells * np.array(scale[: cells.shape[1]]), int(memory["decimation"])
 
@@ -499,7 +498,7 @@ def line_buses(name: str, trains: int) -> list[str]:
     return [f"{stem}{number}" for number in range(first, first + trains)]
 
 
-def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
+def _run_hil(session: Session) -> None:
     options, loaded = session.options, session.loaded
     choice = choose_bus(options.bus)
     if choice.interface == "virtual":
@@ -524,7 +523,7 @@ def _run_hil(session: Session, calibrations: list[Calibration]) -> None:
             faults.save(session.faults.bus, session.faults.file, kept)
         events = hil.run(
             scenario=loaded.source,
-            controllers=calibrations,
+            controllers=session.calibrations,
             buses=buses,
             runs=session.runs,
             seed=options.seed,
@@ -673,10 +672,9 @@ def _on_run(
 def _tell_memory(session: Session, tap: hil.Node, run: int, kept: Path) -> None:
     """The learning memory of the run to the recorder, if its file is still that of this run."""
     assert session.options.memory is not None
-    calibration = setup.calibration_for(session.loaded, session.law)
-    stored = store.load(session.options.memory, calibration)
+    stored = store.load(session.options.memory, session.calibrations[0])
     if stored.iteration == run:
-        cells, decimation = _learned(session, calibration, stored.cells)
+        cells, decimation = _learned(session, stored.cells)
         file = kept / f"memory_{run}.npy"
         np.save(file, cells)
         tap.command(command="memory", run=run, file=str(file), decimation=decimation)

@@ -14,9 +14,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from can_dbc.codec import FORCE_CMD, MESSAGES
+from can_dbc.codec import FORCE_CMD
 from can_dbc.faults import CONTROLLER, PLANT, Event, Frame, Plan, Receiver, in_order
-from can_dbc.inbox import Inbox
+from can_dbc.inbox import Inbox, fresh_frames
 from controller import node as controller_node
 from controller.interface import fault_names
 from controller.process import inbox_of
@@ -26,7 +26,6 @@ from plant_sim.scenario import Loaded
 from tools.frames import FRAME
 from tools.sil import RunResult
 
-FRAME_IDS = [message.frame_id for message in MESSAGES]
 ANNOUNCEMENTS = 20  # of an end that a controller does not hear
 
 
@@ -57,15 +56,6 @@ class Watch(Protocol):
 
     def applied(self, side: Side, tick: int, answer: list[Frame]) -> None:
         """The plant has read its mailboxes."""
-
-
-def fresh_frames(mailboxes: np.ndarray) -> list[Frame]:
-    """What waits in mailboxes to be sent, in sending order; empties them."""
-    fresh = mailboxes["fresh"]
-    words = mailboxes["payload"].tolist()
-    frames = [(FRAME_IDS[i], words[i]) for i in fresh.nonzero()[0].tolist()]
-    fresh.fill(0)
-    return frames
 
 
 def run_line(

@@ -7,8 +7,6 @@ thresholds.
 """
 
 import json
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -253,18 +251,12 @@ def test_without_lead_the_lag_makes_learning_diverge():
 
 
 @pytest.mark.long
-def test_a_whole_run_over_the_bus_has_the_bits_of_sil(tmp_path):
+def test_a_whole_run_over_the_bus_has_the_bits_of_sil(ato_hil, tmp_path):
     """247 301 ticks: the tick of the frames wraps three times."""
     digests = []
     for mode, bus in (("sil", "none"), ("hil", f"hub:{tmp_path.name[-20:]}")):
         arguments = ["run", REV, "--runs", "1", "--no-trace", "--mode", mode, "--bus", bus]
-        done = subprocess.run(
-            [sys.executable, "-m", "tools.cli", *arguments, "--out", str(tmp_path / mode)],
-            capture_output=True,
-            text=True,
-            timeout=1200,
-            check=False,
-        )
+        done = ato_hil(*arguments, "--out", mode, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         summary = json.loads((tmp_path / mode / "summary.json").read_text())
         assert summary["runs"][0]["ticks"] == 247_301
@@ -350,21 +342,14 @@ pitch_m = 8.0
 
 
 @pytest.mark.long
-def test_learning_by_place_has_the_same_bits_over_the_bus(tmp_path):
+def test_learning_by_place_has_the_same_bits_over_the_bus(ato_hil, tmp_path):
     """Every frame, and the memory that is left: six pitches of 8 m, and one over the end."""
     (tmp_path / "short.toml").write_text(SHORT_WAY)
     digests = []
     for mode, bus in (("sil", "none"), ("hil", f"hub:{tmp_path.name[-20:]}")):
         arguments = ["run", "short.toml", "--no-trace", "--mode", mode, "--bus", bus]
         arguments += ["--out", mode, "--memory", f"{mode}.bin"]
-        done = subprocess.run(
-            [sys.executable, "-m", "tools.cli", *arguments],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=1200,
-            check=False,
-        )
+        done = ato_hil(*arguments, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         summary = json.loads((tmp_path / mode / "summary.json").read_text())
         assert summary["runs"][0]["ticks"] == 2051

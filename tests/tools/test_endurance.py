@@ -17,6 +17,11 @@ from tools import endurance
 from tools.cli import app
 from tools.setup import calibration_for
 
+needs_proc = pytest.mark.skipif(
+    not Path("/proc/self/environ").exists(),
+    reason="ato-hil endurance refuses other systems: it finds processes by /proc",
+)
+
 
 def trial_of(victim="plant"):
     return endurance.Trial(1, victim, signal.SIGKILL, "lockstep", 1.0)
@@ -116,7 +121,7 @@ def test_a_trace_that_cannot_be_read_is_found(tmp_path):
     assert endurance._complaints_of_trace(path, True, []) == []
 
 
-@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="Linux only")
+@needs_proc
 def test_processes_of_a_trial_are_found_by_their_mark(monkeypatch):
     monkeypatch.setenv(endurance.MARK, "of-this-test")
     command = [sys.executable, "-c", "input()", "a-word"]
@@ -144,7 +149,7 @@ def test_a_campaign_that_is_interrupted_counts_what_was_done(tmp_path, monkeypat
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="Linux only")
+@needs_proc
 def test_sessions_end_named_and_clean_whoever_is_struck(tmp_path):
     outcomes = list(endurance.campaign(endurance.plan(8, 1), tmp_path))
     assert [(each.cause, each.complaints) for each in outcomes if each.complaints] == []

@@ -214,7 +214,9 @@ class Stopper(Listener):
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="Linux only")
+@pytest.mark.skipif(
+    not Path("/proc/self/environ").exists(), reason="it finds the process to stop by /proc"
+)
 def test_a_controller_that_stands_still_for_a_while_ends_no_run(short_text, tmp_path, monkeypatch):
     """Its commands are held and counted, and the run goes on to its end."""
     scenario = tmp_path / "moving.toml"

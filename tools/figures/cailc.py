@@ -106,24 +106,29 @@ def position(folders: list[Folder]) -> Figure:
     return figure
 
 
-def speed_errors(folders: list[Folder]) -> Figure:
-    """Largest speed error by run."""
-    paper = (1e3 * SPEED_ERROR_M_S, "paper, CAILC: 3.88 mm/s")
-    figure, (axes,) = panels()
-    plots.errors_by_run(axes, folders, named(folders, LAWS), "max_speed_error_m_s", 1e3, paper)
-    axes.set_ylabel("largest speed error [mm/s]")
-    legend_above(figure, axes, columns=2)
-    return figure
+def errors_by_run(
+    key: str, label: str, factor: float, paper: tuple[float, str]
+) -> Callable[[list[Folder]], Figure]:
+    """The largest error of each run, and what the paper states of it."""
+
+    def draw(folders: list[Folder]) -> Figure:
+        figure, (axes,) = panels()
+        plots.errors_by_run(axes, folders, named(folders, LAWS), key, factor, paper)
+        axes.set_ylabel(label)
+        legend_above(figure, axes, columns=2)
+        return figure
+
+    return draw
 
 
-def position_errors(folders: list[Folder]) -> Figure:
-    """Largest position error by run."""
-    paper = (1e3 * POSITION_ERROR_M, "paper, CAILC: 8.34 mm")
-    figure, (axes,) = panels()
-    plots.errors_by_run(axes, folders, named(folders, LAWS), "max_position_error_m", 1e3, paper)
-    axes.set_ylabel("largest position error [mm]")
-    legend_above(figure, axes, columns=2)
-    return figure
+speed_errors = errors_by_run(
+    *("max_speed_error_m_s", "largest speed error [mm/s]", 1e3),
+    (1e3 * SPEED_ERROR_M_S, "paper, CAILC: 3.88 mm/s"),
+)
+position_errors = errors_by_run(
+    *("max_position_error_m", "largest position error [mm]", 1e3),
+    (1e3 * POSITION_ERROR_M, "paper, CAILC: 8.34 mm"),
+)
 
 
 def acceleration(folders: list[Folder]) -> Figure:

@@ -75,43 +75,37 @@ def speed(law: str) -> Callable[[list[Folder]], Figure]:
     return draw
 
 
-def speed_error(law: str) -> Callable[[list[Folder]], Figure]:
-    """Speed error of each train."""
+def each_train(
+    law: str, entity: str, label: str, factor: float = 1.0, *, decades: bool = False
+) -> Callable[[list[Folder]], Figure]:
+    """An entity of the trace of each train, times `factor`; over decades or evenly."""
 
     def draw(folders: list[Folder]) -> Figure:
         folder, run = _of(folders, law)
         figure, (axes,) = panels()
-        _trains(axes, folder, run, "truth/speed_error_m_s", 1e3)
-        axes.set_ylabel("speed error [mm/s]")
+        _trains(axes, folder, run, entity, factor)
+        if decades:
+            axes.set_yscale("log")
+        axes.set_ylabel(label)
         legend_above(figure, axes, columns=5)
         return figure
 
     return draw
+
+
+def speed_error(law: str) -> Callable[[list[Folder]], Figure]:
+    """Speed error of each train."""
+    return each_train(law, "truth/speed_error_m_s", "speed error [mm/s]", 1e3)
 
 
 def control_input(law: str) -> Callable[[list[Folder]], Figure]:
     """Commanded force of each train, for each kilogram."""
 
     def draw(folders: list[Folder]) -> Figure:
-        folder, run = _of(folders, law)
-        figure, (axes,) = panels()
-        _trains(axes, folder, run, "bus/force", 1.0 / folder.scenario.train.mass_kg)
-        axes.set_ylabel("control input [m/s²]")
-        legend_above(figure, axes, columns=5)
-        return figure
+        mass_kg = _of(folders, law)[0].scenario.train.mass_kg
+        return each_train(law, "bus/force", "control input [m/s²]", 1.0 / mass_kg)(folders)
 
     return draw
-
-
-def estimate(folders: list[Folder]) -> Figure:
-    """The single value that each train learns."""
-    folder, run = _of(folders, SVL)
-    figure, (axes,) = panels()
-    _trains(axes, folder, run, f"bus/estimate_{THETA}", 1.0)
-    axes.set_yscale("log")
-    axes.set_ylabel(r"$\hat\Theta$ [1/s]")
-    legend_above(figure, axes, columns=5)
-    return figure
 
 
 def pid_position_error(folders: list[Folder]) -> Figure:
@@ -123,16 +117,6 @@ def pid_position_error(folders: list[Folder]) -> Figure:
     axes.axhline(PID_RANGE_M[0], **STATED)
     axes.set_ylabel("$x_d - x$ [m]")
     legend_above(figure, axes, columns=3)
-    return figure
-
-
-def pid_speed_error(folders: list[Folder]) -> Figure:
-    """Speed error with the PID, likewise."""
-    folder, run = _of(folders, PID)
-    figure, (axes,) = panels()
-    _trains(axes, folder, run, "truth/speed_error_m_s", -1.0)
-    axes.set_ylabel("$v_d - v$ [m/s]")
-    legend_above(figure, axes, columns=5)
     return figure
 
 
@@ -162,7 +146,8 @@ FIGURES = (
     Drawing(4, "speed", "Desired speed and speed of each train", speed(POC)),
     Drawing(5, "speed-error", "Speed error of each train", speed_error(POC)),
     Drawing(6, "control-input", "Control input of each train", control_input(POC)),
-    Drawing(7, "estimate-single", "Estimate of each train, single-value learning", estimate),
+    Drawing(7, "estimate-single", "Estimate of each train, single-value learning",
+            each_train(SVL, f"bus/estimate_{THETA}", r"$\hat\Theta$ [1/s]", decades=True)),
     Drawing(8, "position-single", "Desired position and position, single-value learning",
             position(SVL)),
     Drawing(9, "position-error-single", "Position error, single-value learning",
@@ -172,5 +157,6 @@ FIGURES = (
     Drawing(12, "control-input-single", "Control input, single-value learning",
             control_input(SVL)),
     Drawing(13, "position-error-pid", "Position error with the PID", pid_position_error),
-    Drawing(14, "speed-error-pid", "Speed error with the PID", pid_speed_error),
+    Drawing(14, "speed-error-pid", "Speed error with the PID",  # v_d - v, as the paper
+            each_train(PID, "truth/speed_error_m_s", "$v_d - v$ [m/s]", -1.0)),
 )  # fmt: skip

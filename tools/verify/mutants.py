@@ -11,7 +11,7 @@ import ast
 import copy
 import importlib
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from types import CodeType, ModuleType, SimpleNamespace
 from typing import Any
@@ -55,6 +55,16 @@ def mutants(module: ModuleType) -> Iterator[tuple[str, Any]]:
                     exec(compile(alone, str(module.__file__), "exec"), names)
                     text = f"{there.lineno}: {function.name}: {_shown(node)} -> {_shown(there)}"
                     yield text, SimpleNamespace(**names)
+
+
+def is_caught(mutant: Any, checks: Iterable[Callable[[Any], None]]) -> bool:
+    """Whether one of the checks fails on it; each takes the names of a module."""
+    for check in checks:
+        try:
+            check(mutant)
+        except Exception:
+            return True
+    return False
 
 
 def _names(module: ModuleType) -> dict[str, Any]:
