@@ -237,6 +237,8 @@ def _complaints(trial: Trial, folder: Path, status: int, said: str) -> list[str]
     try:
         summary = json.loads((folder / "out" / "summary.json").read_bytes())
         runs = [row["run"] for row in summary["runs"]]
+        if runs != list(range(1, len(runs) + 1)):
+            found.append(f"summary.json leaves runs out: {runs}")
         if status == 3 and not summary.get("ended_early"):
             found.append("summary.json does not say why it ended")
     except (OSError, ValueError, KeyError) as error:

@@ -53,6 +53,8 @@ class Node:
     process: subprocess.Popen[str]
     log: Path
     said: dict[str, dict[str, Any]] = field(default_factory=dict)  # last event of each kind
+    # Its account of each run that has ended: a node may be a run or more behind another.
+    runs: dict[int, dict[str, Any]] = field(default_factory=dict)
     heard_s: float = field(default_factory=time.monotonic)  # when it last said something
     stopped_s: float | None = None  # since when it is known to be stopped
 
@@ -98,8 +100,8 @@ class Bench:
                 end_hung_hub(channel)
 
     def over(self, run: int | None) -> bool:
-        """Whether every node has given its account of a run."""
-        return all(last_run(node) == run for node in self.accountants)
+        """Whether every accountant has told of a run."""
+        return all(run in node.runs for node in self.accountants)
 
     def start(self, name: str, arguments: list[str]) -> Node:
         """A child process that speaks JSON lines; its stderr goes to OUT/NAME.log."""
@@ -135,6 +137,8 @@ class Bench:
         except queue.Empty:
             return None
         node.said[event["event"]] = event
+        if event["event"] == "run":
+            node.runs[event["run"]] = event
         node.heard_s = time.monotonic()
         if event["event"] == "error":
             raise RunError(event["message"])
@@ -337,7 +341,7 @@ def run(
                 deadline = deadline or time.monotonic() + ACCOUNT_TIMEOUT_S
                 if time.monotonic() > deadline:  # it may have lost just the frame that says so
                     run = last_run(leader)
-                    late = [node.name for node in bench.accountants if last_run(node) != run]
+                    late = [node.name for node in bench.accountants if run not in node.runs]
                     raise RunError(f"the {', '.join(late)} has not seen the end of run {run}")
 
 
@@ -365,5 +369,4 @@ def _strike(
 
 def last_run(node: Node) -> int | None:
     """The last run that a node has told the end of."""
-    run: int | None = node.said.get("run", {}).get("run")
-    return run
+    return max(node.runs, default=None)

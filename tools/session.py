@@ -596,9 +596,10 @@ def _on_event(
         nodes = " and ".join(session.options.external)
         session.listener.note(f"ready; the {nodes} may join within {PATIENCE_S:g} s")
     elif kind == "run":
-        led, run = bench.nodes[leader].said, event["run"]
-        if hil.last_run(bench.nodes[leader]) == run and bench.over(run):
-            _on_run(session, bench, led["run"], bench.nodes["recorder"].said["run"], kept)
+        run = event["run"]
+        led = bench.nodes[leader].runs.get(run)
+        if led is not None and bench.over(run):
+            _on_run(session, bench, led, bench.nodes["recorder"].runs[run], kept)
 
 
 def _on_run(
@@ -652,8 +653,8 @@ def _on_run(
     if session.account is not None:
         of_nodes = {}
         for name, node in bench.nodes.items():
-            if "timing" in node.said.get("run", {}):
-                file = Path(node.said["run"]["timing"])
+            if "timing" in node.runs.get(run, {}):
+                file = Path(node.runs[run]["timing"])
                 of_nodes[name] = np.load(file)
                 file.unlink()
         timing = session.account.add(of_nodes)

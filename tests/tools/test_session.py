@@ -12,6 +12,7 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import can
@@ -297,18 +298,18 @@ def start_long_run(tmp_path: Path) -> subprocess.Popen[str]:
     raise AssertionError("the run did not begin")
 
 
-def children(process: subprocess.Popen[str]) -> dict[str, int]:
-    """Process ids of the nodes, by module."""
+def children(parent: int) -> dict[str, int]:
+    """Process ids of the nodes of a session, by module."""
     found = {}
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit():
             continue
         try:
             words = (entry / "cmdline").read_bytes().split(b"\0")
-            parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
+            its_parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
         except (OSError, IndexError, ValueError):
             continue
-        if parent == process.pid and b"-m" in words:
+        if its_parent == parent and b"-m" in words:
             found[words[words.index(b"-m") + 1].decode()] = int(entry.name)
     return found
 
@@ -327,7 +328,7 @@ def test_what_ends_a_run_early_is_named_and_leaves_nothing_behind(
     ato_hil, tmp_path: Path, victim: str | None, number: signal.Signals, says: str, code: int
 ) -> None:
     process = start_long_run(tmp_path)
-    nodes = children(process)
+    nodes = children(process.pid)
     assert set(nodes) == {"controller.process", "plant_sim.process", "tools.recorder"}
     os.kill(nodes[victim] if victim else process.pid, number)
     _out, errors = process.communicate(timeout=60)
@@ -352,6 +353,31 @@ def test_what_ends_a_run_early_is_named_and_leaves_nothing_behind(
         assert again.returncode == 0, again.stderr
         assert "missing" not in again.stdout
         assert "commands as recorded" in again.stdout.splitlines()[-1]
+
+
+class HoldsRecorder(Screen):
+    """Holds the recorder up in the first run, until the plant must have finished it."""
+
+    def __init__(self) -> None:
+        super().__init__(Mode.hil)
+        self.held = False
+
+    def progress(self, run: int, tick: int) -> None:
+        super().progress(run, tick)
+        if not self.held and tick:
+            self.held = True
+            recorder = children(os.getpid())["tools.recorder"]
+            os.kill(recorder, signal.SIGSTOP)
+            Timer(1.5, os.kill, (recorder, signal.SIGCONT)).start()
+
+
+def test_a_recorder_that_falls_runs_behind_costs_no_row(short: Path, tmp_path: Path) -> None:
+    listener = HoldsRecorder()
+    options = Options(str(short), None, 12, "hil", channel(tmp_path), 1, tmp_path / "out", None)
+    rows = run(options, listener)["runs"]
+    assert listener.held
+    assert [row["run"] for row in rows] == list(range(1, 13))
+    assert {row["ticks"] for row in rows} == {2001}
 
 
 def test_a_bus_that_ends_while_it_is_listened_to_is_named(tmp_path: Path, monkeypatch) -> None:
