@@ -265,13 +265,14 @@ def _links(settings: GuardSettings) -> tuple[np.ndarray, np.ndarray]:
     """What the receivers tolerate: of messages that come every tick, and of those every 100 ms.
 
     A link that gets a frame now and then stays young but is no longer valid; one that misses frames
-    for less than the largest age stays valid.
+    for less than the largest age stays valid. Noise that hits an identifier twice in a window is
+    chance, three times is not; of a message that comes every tick, a quarter may be corrupt.
     """
     jump = _whole("control.guard.counter_jump_max", settings.counter_jump_max, 1, e2e.DELTA_ANY)
     few = max(min(3, e2e.WINDOW - 2 - settings.age_max_ticks), 0)
     every_tick, slow = np.zeros(1, e2e.SETTING), np.zeros(1, e2e.SETTING)
     every_tick[0] = (jump, max(few, 1), 2, few, 4, 12, 0, 0)
-    slow[0] = (jump, 1, 1, 0, 1, 1, 0, 0)
+    slow[0] = (jump, 1, 1, 0, 2, 1, 1, 0)
     return every_tick, slow
 
 

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from can_dbc import e2e
 from controller import calibration, distribution, reference
 from controller.calibration import GuardSettings, Line, MemorySettings, PlausibleSettings
 from controller.memory import initial_memory
@@ -155,6 +156,20 @@ def test_links_that_miss_frames_for_less_than_the_largest_age_stay_valid():
         assert params["every_tick"]["init_ok_min"] == max(few, 1)
         assert params["every_tick"]["delta_max"] == params["slow"]["delta_max"] == 7
         assert params["slow"]["valid_ok_min"] == 0
+
+
+def test_two_corrupt_frames_in_a_window_are_chance_and_three_are_not():
+    slow = calibrate().params[0]["slow"]
+    link = np.zeros(1, e2e.LINK)
+    e2e.begin_link(link[0])
+    for found, state in (
+        *((e2e.OK, e2e.INIT), (e2e.OK, e2e.VALID)),
+        *((e2e.CORRUPT, e2e.VALID), (e2e.CORRUPT, e2e.VALID), (e2e.CORRUPT, e2e.INVALID)),
+        *[(e2e.NONE, e2e.INVALID)] * (e2e.WINDOW - 2),
+        (e2e.OK, e2e.VALID),  # one corrupt frame is left in the window
+    ):
+        e2e.supervise(slow, link[0], np.int64(found))
+        assert link[0]["state"] == state
 
 
 def test_a_brake_is_a_brake_whatever_its_sign():
