@@ -25,7 +25,7 @@ numbers): a message that no longer comes, age_max + 1 after its last good frame 
 control_age_max + 1), and a position whose Tick is as old; one that is corrupt more often than its
 link's state machine tolerates, no later than that; what a frame itself says (speed, supervision,
 quality, an implausible value), 0: the FORCE_CMD of the tick that received it. Position and speed
-that disagree: as in `plausibility.py`.
+that disagree: `plausibility.reaction_ticks`, by how much.
 """
 
 from __future__ import annotations

@@ -7,14 +7,18 @@
 with n the control periods between the samples: a message may be missing for a while, and its value
 is held meanwhile. A window starts anew when it is over; the sum is that of trapezia.
 
-What is constantly wrong by e m/s (a sensor that stands still, a wheel that slips) is found within
-2 progress_max / e where that is less than two windows, whenever it begins.
+What is constantly wrong by e m/s (a sensor that stands still or runs away) is found within
+2 progress_max / e where that is less than two windows, whenever it begins (`reaction_ticks`).
+
+What deceives both alike, as a wheel that slips does where it is the source of both, is seen by its
+jump alone.
 
 Contract: reads and writes its own state; returns fault bits; the same few operations a tick.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -60,6 +64,17 @@ STATE = np.dtype(
 )
 
 TICKS_MAX = 1 << 16  # where the ages of the samples stop; a link is lost long before
+
+
+def reaction_ticks(params: Any, wrong_m_s: float) -> int | None:
+    """Within how many ticks it is found that the change of position and the speed disagree by so
+    much from now on, as long as positions come every tick; None if that may never be.
+
+    The window in which it begins may end just before; `params` is one record of PARAMS.
+    """
+    apart_m_a_tick = wrong_m_s * int(params["period"]) / 2**30
+    ticks = math.floor(int(params["progress_max"]) / 2**15 / apart_m_a_tick) + 2  # 1 for rounding
+    return 2 * ticks if ticks <= int(params["window"]) else None
 
 
 @step

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from controller import plausibility
@@ -234,3 +234,30 @@ def test_a_constant_error_is_found_in_the_time_that_the_docstring_gives(
             return
         moved += speed
     raise AssertionError("not found")
+
+
+@given(
+    begins=st.integers(2, 250),
+    wrong_m_s=st.floats(0.01, 60.0),
+    progress_max=st.integers(0, 3 * X),
+    speed_m_s=st.floats(-60.0, 60.0),
+)
+def test_what_is_constantly_wrong_is_found_in_the_time_that_is_stated(
+    plain: Any, begins: int, wrong_m_s: float, progress_max: int, speed_m_s: float
+) -> None:
+    sensors = Sensors(plain, progress_max=progress_max)
+    bound = plausibility.reaction_ticks(vars(sensors.params), wrong_m_s)
+    assume(bound is not None)
+    assert bound is not None
+    speed, position_m = round(speed_m_s * V), 0.0
+    for tick in range(begins + bound):
+        position_m += speed_m_s / 128 + (wrong_m_s / 128 if tick >= begins else 0.0)
+        if sensors.tick(speed, round(position_m * X)) & FAULT_PROGRESS and tick >= begins:
+            return
+    raise AssertionError(f"not found within {bound} ticks")
+
+
+def test_what_is_too_little_wrong_has_no_bound() -> None:
+    setting = vars(params(progress_max=X, window=256))  # 1 m in 2 s
+    assert plausibility.reaction_ticks(setting, 0.5) is None
+    assert plausibility.reaction_ticks(setting, 1.0) == 2 * (128 + 2)

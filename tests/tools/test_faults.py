@@ -10,7 +10,14 @@ from typing import Any
 
 import pytest
 
-from tools import session
+from can_dbc import faults
+from can_dbc.codec import ATO_STATUS
+from controller.interface import GUARD_NORMAL, GUARD_SERVICE_BRAKE
+from controller.plausibility import reaction_ticks
+from plant_sim import failures
+from plant_sim.scenario import load
+from tools import session, setup, sil, sil_faults
+from tools.frames import held
 from tools.hil import RunError
 
 FAULTS = """
@@ -140,9 +147,9 @@ def check_cut(folder: Path) -> None:
     assert (folder / "trace.rrd").stat().st_size > 0
 
 
-def test_a_run_that_cannot_begin_ends_with_its_cause(short: Path, tmp_path: Path) -> None:
+def test_a_run_that_cannot_begin_ends_with_its_cause(silent, short: Path, tmp_path: Path) -> None:
     with pytest.raises(RunError) as ended:
-        session.run(asked(short, tmp_path, CUT), Nobody())
+        session.run(asked(short, tmp_path, CUT), silent)
     assert str(ended.value) == CAUSE
     check_cut(tmp_path / "o")
 
@@ -156,15 +163,6 @@ def test_on_a_bus_it_ends_with_the_same_cause(ato_hil, short: Path, tmp_path: Pa
     assert f"ato-hil: {CAUSE}" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     check_cut(tmp_path / "o")
-
-
-class Nobody:
-    """Watches a session without a word."""
-
-    def begin(self, *_: Any) -> None: ...
-    def note(self, text: str) -> None: ...
-    def progress(self, run: int, tick: int) -> None: ...
-    def row(self, row: dict[str, Any]) -> None: ...
 
 
 def asked(scenario: Path, folder: Path, text: str | None, **options: Any) -> session.Options:
@@ -207,12 +205,12 @@ PROCESS = '[[process]]\nnode = "{}"\nsignal = "{}"\nat_s = 1.0\n'
     ],
 )
 def test_bad_input_is_one_line(
-    short: Path, tmp_path: Path, text: str | None, options: dict, says: str
+    silent, short: Path, tmp_path: Path, text: str | None, options: dict, says: str
 ) -> None:
     if "external" in options:
         options = {**options, "mode": "hil"}
     with pytest.raises(ValueError) as refused:
-        session.run(asked(short, tmp_path, text, **options), Nobody())
+        session.run(asked(short, tmp_path, text, **options), silent)
     assert str(refused.value).startswith(f"{tmp_path / 'faults.toml'}: {says}")
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "o").exists()
@@ -253,3 +251,55 @@ def test_a_signal_ends_the_run_with_its_cause(
     (row,) = csv.DictReader((tmp_path / "o" / "faults.csv").read_text().splitlines())
     assert (row["run"], row["node"], row["kind"]) == ("1", node, signal)
     assert int(row["tick"]) >= 100
+
+
+def first_run(scenario: Path, file: Path) -> tuple[Any, sil.RunResult]:
+    """Parameters of the controller, and run 1 with these faults."""
+    loaded = load(str(scenario))
+    nodes = setup.controllers_for([loaded], "pid")
+    (results,) = sil_faults.run_line(
+        *(loaded, nodes),
+        runs=range(1, 2),
+        seed=1,
+        plan=faults.load(file, 1, loaded.scenario.period_s),
+        fails=failures.load(file),
+    )
+    return nodes[0].params[0], results[0]
+
+
+WRONG_FROM = 900  # tick, from which on the train is faster than 3.5 m/s for 1.2 s
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("fault", "wrong_m_s"),
+    [
+        ('kind = "drift"\nquantity = "position"\nrate_per_s = 0.5', 0.5),
+        ('kind = "drift"\nquantity = "position"\nrate_per_s = -3.0', 3.0),
+        ('kind = "stuck"\nquantity = "position"', 3.5),
+        ('kind = "offset"\nquantity = "speed"\noffset = 0.4', 0.4),
+    ],
+)
+def test_sensors_that_disagree_stop_the_train_in_the_time_that_is_stated(
+    short: Path, tmp_path: Path, fault: str, wrong_m_s: float
+) -> None:
+    file = tmp_path / "faults.toml"
+    file.write_text(f"[[sensor]]\n{fault}\nfrom_tick = {WRONG_FROM}\n")
+    params, result = first_run(short, file)
+    bound = reaction_ticks(params["plausibility"], wrong_m_s)
+    assert bound is not None
+    assert min(result.truth["speed_m_s"][WRONG_FROM : WRONG_FROM + 120]) > 3.5
+    assert result.faults[0] == "position and speed disagree"
+    guard = held(result.frames, len(result.truth), ATO_STATUS, "Guard")
+    assert set(guard[:WRONG_FROM]) == {GUARD_NORMAL}
+    assert set(guard[WRONG_FROM + bound + 1 :]) == {GUARD_SERVICE_BRAKE}
+
+
+@pytest.mark.long
+def test_a_wheel_that_slips_a_little_deceives_both(short: Path, tmp_path: Path) -> None:
+    """Speed and position come from one wheel here: they agree. See docs/faults.md."""
+    file = tmp_path / "faults.toml"
+    file.write_text(f'[[sensor]]\nkind = "slip"\nshare = 0.1\nfrom_tick = {WRONG_FROM}\n')
+    _params, result = first_run(short, file)
+    assert result.faults == []
+    assert result.truth["position_m"][-1] < 44.0  # of 45: it stops short
