@@ -124,6 +124,8 @@ CORE_STATE = np.dtype(
         ("force", np.int32),  # total force sent, N Q4
         ("map_section", np.int32),  # of the gradient map
         ("stamp", np.int32),  # Tick of the last TRAIN_POSITION
+        ("measured", np.int32),  # position in it, m, Q15
+        ("padding", np.int32),
         ("car_force", np.int32, (distribution.CARS_MAX,)),  # N Q4
         # Next end-to-end counter of each message sent; an even number, so that nothing is padded.
         ("sent", np.int32, (MESSAGE_COUNT + MESSAGE_COUNT % 2,)),
@@ -181,18 +183,19 @@ def begin(params: Any, profile: Any, state: Any, cells: Any, rate: Any) -> None:
     """State of a new run: reference at its start, counters at 0, no fault; the learning memory
     stays. `rate` of its timetable, less 1, Q24."""
     core = state.core
+    reference.rewind(state.cursor, profile, rate)
     core.tick = 0
     core.faults = 0
     core.guard = GUARD_NORMAL
     core.force = 0
     core.map_section = 0
     core.stamp = 0
+    core.measured = sat32(reference.position(state.cursor) + int64(params.neighbours.start))
     for i in range(MESSAGE_COUNT):
         core.sent[i] = 0
         e2e.begin_link(state.links[i])
     guard.begin(state.seen, state.guard)
     plausibility.begin(state.plausibility)
-    reference.rewind(state.cursor, profile, rate)
     reference.rewind(state.ahead, profile, rate)
     for i in range(reference.PREVIEW_MAX):
         if i < int64(params.reference.preview):
@@ -201,6 +204,7 @@ def begin(params: Any, profile: Any, state: Any, cells: Any, rate: Any) -> None:
     rebasing.begin(state.rebasing)
     memory.rewind(params.memory, state.memory, cells, state.cell)
     state.inputs.limited = 0
+    state.inputs.speed = 0
 
 
 @step
@@ -243,9 +247,18 @@ def stamp_age(core: Any) -> Any:
 
 
 @step
+def position_now(params: Any, core: Any, speed: Any) -> Any:
+    """Where the train is by dead reckoning: the last measured position, m, Q15, and the way since
+    it was measured, at the present speed, Q24. A frame may be missing, or come late."""
+    way_per_tick = (speed * int64(params.guard.period)) >> 30  # m, Q24
+    way = round_shift(way_per_tick * stamp_age(core), Q_SPEED - Q_POSITION)
+    return sat32(int64(core.measured) + way)
+
+
+@step
 def read_inputs(params: Any, state: Any, rx: Any) -> None:
     """Measurements, limit and tick from the mailboxes that pass their check; the others keep their
-    last value."""
+    last value, but for the position, which goes on."""
     core = state.core
     inputs = state.inputs
     seen = state.seen
@@ -258,10 +271,11 @@ def read_inputs(params: Any, state: Any, rx: Any) -> None:
     position_is_new = receive(params.every_tick, state, rx, TRAIN_POSITION)
     if position_is_new != 0:
         word = int64(rx[TRAIN_POSITION.index].payload)
-        inputs.position = get(word, TRAIN_POSITION.Position) << _POSITION_SHIFT
+        core.measured = get(word, TRAIN_POSITION.Position) << _POSITION_SHIFT
         core.stamp = get(word, TRAIN_POSITION.Tick)
         if int64(core.stamp) != (int64(core.tick) & TICK_MASK):
             core.faults = int64(core.faults) | FAULT_TICK
+    inputs.position = position_now(params, core, int64(inputs.speed))
     if receive(params.every_tick, state, rx, ATP_LIMIT) != 0:
         word = int64(rx[ATP_LIMIT.index].payload)
         permitted = get(word, ATP_LIMIT.PermittedSpeed) * _PERMITTED_FACTOR

@@ -444,11 +444,11 @@ def test_run_control_may_be_older(running):
     assert running.core["faults"] == FAULT_CONTROL_LOST
 
 
-def test_a_missed_measurement_keeps_the_last_value(running):
+def test_a_missed_measurement_keeps_the_last_speed(running):
     running.run_tick(speed=0.5, position=2.0)
     running.run_tick(speed=0.7, position=3.0, without=[TRAIN_SPEED, TRAIN_POSITION])
     assert running.inputs["speed"] == 1 << 23
-    assert running.inputs["position"] == 2 << 15
+    assert running.inputs["position"] == round(2.005 * 2**15)
 
 
 @pytest.mark.parametrize("bit", [0, 9, 13, 20, 63])
@@ -590,6 +590,49 @@ def test_an_invalid_sensor_brakes_the_train(running):
     assert running.core["guard"] == GUARD_NORMAL
     running.run_tick(quality=2)
     assert running.core["faults"] == FAULT_SENSOR
+
+
+@given(
+    speed=st.integers(-127 * 2**18, 127 * 2**18),
+    position=st.integers(-60_000 * 2**15, 60_000 * 2**15),
+    missing=st.lists(st.booleans(), max_size=AGE_MAX),
+    late=st.integers(0, AGE_MAX),
+)
+@settings(max_examples=50)
+def test_the_position_goes_on_at_the_speed_of_the_train(built, speed, position, missing, late):
+    """A frame that is missing, or comes late, costs the law no more than rounding."""
+    bench = Bench(built)
+    bench.start()
+    v, x = speed / 2**18, position / 2**15
+
+    def at(tick):
+        return x + v * 0.01 * tick
+
+    bench.run_tick(v, at(0))
+    assert bench.inputs["position"] == position
+    for tick, gone in enumerate(missing, 1):
+        bench.run_tick(v, at(tick), without=[TRAIN_POSITION] * gone)
+        assert abs(bench.inputs["position"] - at(tick) * 2**15) <= 2
+    for tick in range(len(missing) + 1, len(missing) + 10):
+        bench.run_tick(v, at(tick - late), tick=tick - late)
+        assert abs(bench.inputs["position"] - at(tick) * 2**15) <= 2
+    assert bench.core["faults"] & ~FAULT_OVERSPEED == (FAULT_TICK if late else 0)
+
+
+def test_a_run_whose_first_frames_are_missing_begins_where_its_timetable_does(bench):
+    bench.start()
+    for tick in range(20):
+        bench.run_tick(10.0, 300.0 + tick)
+    bench.start(iteration=2)
+    bench.run_tick(without=[TRAIN_POSITION, TRAIN_SPEED])
+    assert (bench.inputs["position"], bench.inputs["speed"]) == (0, 0)
+
+
+def test_on_a_line_it_begins_at_its_place_there(built_on_a_line):
+    bench = Bench(built_on_a_line)
+    bench.start()
+    bench.run_tick(without=[TRAIN_POSITION, TRAIN_SPEED])
+    assert bench.inputs["position"] == bench.inputs["reference_position"] == -500 * 2**15
 
 
 def test_an_emergency_request_lasts_until_the_train_stands(running):

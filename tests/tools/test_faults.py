@@ -15,7 +15,7 @@ from can_dbc.codec import ATO_STATUS
 from controller.interface import GUARD_NORMAL, GUARD_SERVICE_BRAKE
 from controller.plausibility import reaction_ticks
 from plant_sim import failures
-from plant_sim.scenario import load
+from plant_sim.scenario import load, members
 from tools import session, setup, sil, sil_faults
 from tools.frames import held
 from tools.hil import RunError
@@ -253,10 +253,10 @@ def test_a_signal_ends_the_run_with_its_cause(
     assert int(row["tick"]) >= 100
 
 
-def first_run(scenario: Path, file: Path) -> tuple[Any, sil.RunResult]:
-    """Parameters of the controller, and run 1 with these faults."""
-    loaded = load(str(scenario))
-    nodes = setup.controllers_for([loaded], "pid")
+def first_run(scenario: str, law: str, file: Path) -> tuple[Any, list[sil.RunResult]]:
+    """Parameters of the first controller, and run 1 of each train with these faults."""
+    loaded = load(scenario)
+    nodes = setup.controllers_for(members(loaded), law)
     (results,) = sil_faults.run_line(
         *(loaded, nodes),
         runs=range(1, 2),
@@ -264,7 +264,7 @@ def first_run(scenario: Path, file: Path) -> tuple[Any, sil.RunResult]:
         plan=faults.load(file, 1, loaded.scenario.period_s),
         fails=failures.load(file),
     )
-    return nodes[0].params[0], results[0]
+    return nodes[0].params[0], results
 
 
 WRONG_FROM = 900  # tick, from which on the train is faster than 3.5 m/s for 1.2 s
@@ -285,7 +285,7 @@ def test_sensors_that_disagree_stop_the_train_in_the_time_that_is_stated(
 ) -> None:
     file = tmp_path / "faults.toml"
     file.write_text(f"[[sensor]]\n{fault}\nfrom_tick = {WRONG_FROM}\n")
-    params, result = first_run(short, file)
+    params, (result,) = first_run(str(short), "pid", file)
     bound = reaction_ticks(params["plausibility"], wrong_m_s)
     assert bound is not None
     assert min(result.truth["speed_m_s"][WRONG_FROM : WRONG_FROM + 120]) > 3.5
@@ -300,6 +300,26 @@ def test_a_wheel_that_slips_a_little_deceives_both(short: Path, tmp_path: Path) 
     """Speed and position come from one wheel here: they agree. See docs/faults.md."""
     file = tmp_path / "faults.toml"
     file.write_text(f'[[sensor]]\nkind = "slip"\nshare = 0.1\nfrom_tick = {WRONG_FROM}\n')
-    _params, result = first_run(short, file)
+    _params, (result,) = first_run(str(short), "pid", file)
     assert result.faults == []
     assert result.truth["position_m"][-1] < 44.0  # of 45: it stops short
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "fault", ['kind = "drop"\nprobability = 0.02', 'kind = "delay"\nticks = 2\nfrom = 100.0']
+)
+@pytest.mark.parametrize("scenario", ["line", "crh3"])
+def test_positions_that_are_missing_or_late_cost_no_more_than_millimetres(
+    tmp_path: Path, scenario: str, fault: str
+) -> None:
+    """At 22 m/s, with a barrier at 0.2 m, as at 90 m/s: the way of two ticks is 1.8 m."""
+    file = tmp_path / "faults.toml"
+    found = []
+    for text in ("", f'[[bus]]\nmessages = ["TRAIN_POSITION"]\nat = "controller"\n{fault}\n'):
+        file.write_text(text)
+        _params, results = first_run(scenario, load(scenario).scenario.law, file)
+        assert {name for result in results for name in result.faults} <= {"tick jumped"}
+        found.append([result.truth["position_m"] for result in results])
+    for without, within in zip(*found, strict=True):
+        assert 0.0 < abs(without - within).max() < 0.005
