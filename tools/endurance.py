@@ -154,7 +154,7 @@ def attempt(trial: Trial, folder: Path) -> Outcome:
             text=True,
         )
         try:
-            struck_s = _strike(trial, session, mark)
+            struck_s = _strike(trial, session, mark, Path(temporary))
             complaints = [f"no {trial.victim} to strike"] if struck_s is None else []
             try:
                 _out, said = session.communicate(timeout=END_S)
@@ -177,11 +177,14 @@ def attempt(trial: Trial, folder: Path) -> Outcome:
     return Outcome(trial, seconds, cause, tuple(complaints))
 
 
-def _strike(trial: Trial, session: subprocess.Popen[str], mark: str) -> float | None:
+def _strike(
+    trial: Trial, session: subprocess.Popen[str], mark: str, temporary: Path
+) -> float | None:
     """Waits for the victim and the moment, and sends the signal; when that was, None if there was
     no victim.
 
     A hub that nobody uses yet is not missed: for a while, one that follows it is struck as well.
+    One that has deleted its socket in `temporary` is ending: stopped then, nobody could find it.
     """
     last_s = None
     moments_s: dict[int, float] = {}  # by process
@@ -190,6 +193,8 @@ def _strike(trial: Trial, session: subprocess.Popen[str], mark: str) -> float | 
         now_s = time.monotonic()
         for process in _processes(mark, VICTIMS[trial.victim]):
             if now_s < moments_s.setdefault(process, now_s + trial.delay_s):
+                continue
+            if trial.victim == "hub" and not any(temporary.rglob("*.sock")):
                 continue
             moments_s[process] = float("inf")
             with suppress(ProcessLookupError):

@@ -95,9 +95,7 @@ class Bench:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.end()
         for bus in self.buses if kind is not None else ():
-            interface, _colon, channel = bus.partition(":")
-            if interface == "hub":
-                end_hung_hub(channel)
+            clear_bus(bus)
 
     def over(self, run: int | None) -> bool:
         """Whether every accountant has told of a run."""
@@ -209,6 +207,13 @@ class Bench:
         if recorder is not None:
             recorder.process.terminate()
             _wait(recorder, STOP_TIMEOUT_S)
+
+
+def clear_bus(name: str) -> None:
+    """After a failure: an embedded hub that hangs is ended, the socket of a dead one deleted."""
+    interface, _colon, channel = name.partition(":")
+    if interface == "hub":
+        end_hung_hub(channel)
 
 
 def _is_stopped(node: Node) -> bool:

@@ -565,6 +565,7 @@ def _refuse_busy_bus(name: str, listen_s: float) -> None:
         with open_bus(name) as bus:
             busy = bool(recv_frames(bus, listen_s))
     except can.CanError as error:
+        hil.clear_bus(name)
         raise RunError(f"bus {name} is gone: {error}") from None
     if busy:
         raise SessionError(

@@ -19,6 +19,7 @@ import can
 import pytest
 from rerun.chunk import RrdReader
 
+from can_dbc import rendezvous
 from tools import session
 from tools.cli import Mode, Screen
 from tools.hil import RunError
@@ -380,14 +381,24 @@ def test_a_recorder_that_falls_runs_behind_costs_no_row(short: Path, tmp_path: P
     assert {row["ticks"] for row in rows} == {2001}
 
 
-def test_a_bus_that_ends_while_it_is_listened_to_is_named(tmp_path: Path, monkeypatch) -> None:
+def test_a_bus_that_ends_while_it_is_listened_to_is_named(
+    tmp_path: Path, runtime_dir: Path, monkeypatch
+) -> None:
+    """And cleared away, though its socket still takes connections when the node leaves."""
+
     def gone(bus, timeout_s):
+        os.kill(bus.hub_pid, signal.SIGKILL)
+        monkeypatch.setattr(
+            rendezvous, "leave", lambda path: monkeypatch.setattr(rendezvous, "leave", leave)
+        )
         raise can.CanOperationError("the hub (process 7) is gone")
 
+    leave = rendezvous.leave
     monkeypatch.setattr(session, "recv_frames", gone)
     name = channel(tmp_path)
     with pytest.raises(RunError, match=f"^bus {name} is gone: the hub .process 7. is gone$"):
         session._refuse_busy_bus(name, 0.01)
+    assert os.listdir(runtime_dir / "ato-hil") == []
 
 
 def test_two_sessions_do_not_share_a_bus(ato_hil, tmp_path: Path) -> None:
