@@ -146,7 +146,7 @@ class Recording:
     """A recording under way. Use as a context manager: leaving it writes what is still to write.
 
     A thread writes, so that neither the session nor its end by Ctrl-C waits or breaks into a
-    frame that is half written.
+    frame that is half written. It leaves the processor to the nodes, until there are none.
     """
 
     def __init__(self, path: Path, period_s: float, backlog_runs: int = 0) -> None:
@@ -166,7 +166,9 @@ class Recording:
         self._error: Exception | None = None
         self._runs: queue.SimpleQueue[tuple[int, np.ndarray] | None] = queue.SimpleQueue()
         self._room = threading.Semaphore(backlog_runs)
-        self._thread = threading.Thread(target=self._write_all, daemon=True, name="recording")
+        self._batches = self._write()
+        self._nodes_are_gone = threading.Event()
+        self._thread = threading.Thread(target=self._write_meekly, daemon=True, name="recording")
         self._thread.start()
 
     def add(self, run: int, frames: np.ndarray) -> None:
@@ -178,6 +180,16 @@ class Recording:
         self._room.acquire()
         self._raise_error()
 
+    def hurry(self) -> None:
+        """The nodes are gone: the rest is written at the priority of the session."""
+        if self._nodes_are_gone.is_set():
+            return
+        self._nodes_are_gone.set()
+        # A thread may not raise its own priority, so another one goes on.
+        rest = threading.Thread(target=self._write_after, args=(self._thread,), daemon=True)
+        self._thread = rest
+        rest.start()
+
     def __enter__(self) -> Recording:
         return self
 
@@ -187,6 +199,7 @@ class Recording:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self.hurry()
         self._runs.put(None)
         self._thread.join()
         if kind is None:
@@ -197,29 +210,42 @@ class Recording:
             reason = getattr(self._error, "strerror", None) or self._error
             raise RecordError(f"{self._path}: cannot be written: {reason}") from None
 
-    def _write_all(self) -> None:
+    def _write_meekly(self) -> None:
         if sys.platform == "linux":  # where it is that of one thread: the nodes come first
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
+        for _batch in self._batches:
+            if self._nodes_are_gone.is_set():
+                break
+
+    def _write_after(self, first: threading.Thread) -> None:
+        first.join()
+        for _batch in self._batches:
+            pass
+
+    def _write(self) -> Iterator[None]:
+        """Writes what is added, batch by batch, and closes the file."""
         while (item := self._runs.get()) is not None:
             run, frames = item
-            try:
-                if run > self._last_run and self._error is None and len(frames):
-                    self._last_run = run
-                    self._write_run(frames)
-            except Exception as error:  # the writers and asammdf raise what they like
-                self._error = error
+            if run > self._last_run and len(frames):
+                self._last_run = run
+                for start in range(0, len(frames), BATCH_FRAMES):
+                    self._write_batch(frames[start : start + BATCH_FRAMES])
+                    yield
+                self._start_tick += int(frames["tick"][-1]) + 1
             self._room.release()
         try:
             self._writer.stop()
         except Exception as error:
             self._error = self._error or error
 
-    def _write_run(self, frames: np.ndarray) -> None:
-        for start in range(0, len(frames), BATCH_FRAMES):
-            batch = frames[start : start + BATCH_FRAMES]
-            time_s = (self._start_tick + batch["tick"].astype(np.int64)) * self._period_s
+    def _write_batch(self, batch: np.ndarray) -> None:
+        if self._error is not None:
+            return
+        time_s = (self._start_tick + batch["tick"].astype(np.int64)) * self._period_s
+        try:
             write_frames(self._writer, time_s, batch)
-        self._start_tick += int(frames["tick"][-1]) + 1
+        except Exception as error:  # the writers and asammdf raise what they like
+            self._error = error
 
 
 def write_frames(writer: Any, time_s: np.ndarray, frames: np.ndarray) -> None:

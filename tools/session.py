@@ -292,6 +292,8 @@ def _recording(session: Session) -> Iterator[None]:
     backlog = BACKLOG_RUNS if options.mode == "hil" else 0
     period_s = loaded.scenario.period_s
     with record.Recording(options.record, period_s, backlog) as session.recording:
+        if options.mode != "hil":
+            session.recording.hurry()
         yield
 
 
@@ -553,6 +555,7 @@ def _record_the_rest(session: Session, kept: Path) -> None:
     """What the recorder has of runs that were not completed."""
     if session.recording is None:
         return
+    session.recording.hurry()
     for run in session.runs:
         with suppress(OSError, ValueError):  # ValueError: the recorder was killed as it wrote
             session.recording.add(run, np.load(kept / f"frames_{run}.npy"))

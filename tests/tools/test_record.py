@@ -6,7 +6,9 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -126,6 +128,45 @@ def test_an_exception_in_the_session_leaves_a_whole_recording(tmp_path: Path) ->
     with pytest.raises(KeyboardInterrupt):
         interrupted_session()
     assert len(record.read(path).words) == 30_000
+
+
+@pytest.mark.parametrize("after", [0, 1, 2, 3])
+def test_what_is_left_when_the_nodes_are_gone_follows_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int
+) -> None:
+    """`hurry` while batches wait, while none does, before the first: nothing is lost or late."""
+    path = tmp_path / "runs.log"
+    monkeypatch.setattr(record, "BATCH_FRAMES", 100)
+    with Recording(path, 0.01, backlog_runs=9) as recording:
+        for run in range(3):
+            if run == after:
+                recording.hurry()
+            recording.add(run, frames(*((tick, 1, 1000 * run + tick) for tick in range(1000))))
+        recording.hurry()
+    assert record.read(path).words.tolist() == list(range(3000))
+    assert record.read(path).time_s.tolist() == [tick / 100 for tick in range(3000)]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="no priorities in /proc")
+def test_the_rest_is_written_at_the_priority_of_the_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    wrote = record.write_frames
+
+    def write(*given: Any) -> None:
+        seen.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+        wrote(*given)
+
+    monkeypatch.setattr(record, "write_frames", write)
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    with Recording(tmp_path / "runs.log", 0.01) as recording:
+        recording.add(1, frames((0, 1, 1)))
+        recording.hurry()
+        recording.add(2, frames((0, 1, 1)))
+        recording.add(3, frames((0, 1, 1)))
+    assert seen[0] == 19
+    assert seen[-1] == own
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
