@@ -4,8 +4,9 @@
     position   within [x_min, x_max]; from one sample to the next |dx| <= jump_x + n v_max Ts
     progress   since the start of a window |dx - sum v Ts| <= progress_max, at every new position
 
-with n the control periods between the samples: a message may be missing for a while, and its value
-is held meanwhile. A window starts anew when it is over; the sum is that of trapezia.
+with n the control periods between the samples: a message may be missing for a while, and what goes
+on meanwhile (speed held, position by dead reckoning) is not judged. A window starts anew when it is
+over; the sum is that of trapezia.
 
 What is constantly wrong by e m/s (a sensor that stands still or runs away) is found within
 2 progress_max / e where that is less than two windows, whenever it begins (`reaction_ticks`).
@@ -94,7 +95,7 @@ def begin(state: Any) -> None:
 def faults_of_samples(
     params: Any, state: Any, speed: Any, speed_is_new: Any, position: Any, position_is_new: Any
 ) -> Any:
-    """Fault bits of this tick, from speed (Q24) and position (Q15) as held; once a tick."""
+    """Fault bits of this tick, from speed (Q24) and position (Q15) of now; once a tick."""
     faults = faults_of_progress(params, state, speed, position, position_is_new)
     if speed_is_new != 0:
         faults |= faults_of_speed(params, state, speed)

@@ -146,7 +146,8 @@ class Recording:
     """A recording under way. Use as a context manager: leaving it writes what is still to write.
 
     A thread writes, so that neither the session nor its end by Ctrl-C waits or breaks into a
-    frame that is half written. It leaves the processor to the nodes, until there are none.
+    frame that is half written. While runs may wait it leaves the processor to others, until
+    `hurry`.
     """
 
     def __init__(self, path: Path, period_s: float, backlog_runs: int = 0) -> None:
@@ -167,9 +168,11 @@ class Recording:
         self._runs: queue.SimpleQueue[tuple[int, np.ndarray] | None] = queue.SimpleQueue()
         self._room = threading.Semaphore(backlog_runs)
         self._batches = self._write()
-        self._nodes_are_gone = threading.Event()
+        self._in_a_hurry = threading.Event()
         self._thread = threading.Thread(target=self._write_meekly, daemon=True, name="recording")
         self._thread.start()
+        if backlog_runs == 0:  # `add` waits for it anyway
+            self.hurry()
 
     def add(self, run: int, frames: np.ndarray) -> None:
         """Have the FRAME rows of a run written; a run that was added before is not added again.
@@ -181,10 +184,10 @@ class Recording:
         self._raise_error()
 
     def hurry(self) -> None:
-        """The nodes are gone: the rest is written at the priority of the session."""
-        if self._nodes_are_gone.is_set():
+        """From now on, as when the nodes are gone: writing has the priority of the session."""
+        if self._in_a_hurry.is_set():
             return
-        self._nodes_are_gone.set()
+        self._in_a_hurry.set()
         # A thread may not raise its own priority, so another one goes on.
         rest = threading.Thread(target=self._write_after, args=(self._thread,), daemon=True)
         self._thread = rest
@@ -214,7 +217,7 @@ class Recording:
         if sys.platform == "linux":  # where it is that of one thread: the nodes come first
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
         for _batch in self._batches:
-            if self._nodes_are_gone.is_set():
+            if self._in_a_hurry.is_set():
                 break
 
     def _write_after(self, first: threading.Thread) -> None:

@@ -292,8 +292,6 @@ def _recording(session: Session) -> Iterator[None]:
     backlog = BACKLOG_RUNS if options.mode == "hil" else 0
     period_s = loaded.scenario.period_s
     with record.Recording(options.record, period_s, backlog) as session.recording:
-        if options.mode != "hil":
-            session.recording.hurry()
         yield
 
 
