@@ -91,10 +91,10 @@ claims: $(RUN_READY) ## measure what the papers claim again, and write it into d
 	for paper in cailc drac mtcc afilc iplc; do
 		.venv/bin/ato-hil claims "$$paper" --json "runs/claims/$$paper.json"
 	done
-	.venv/bin/python -m tools.docs runs/claims/*.json
+	.venv/bin/python -m ato_hil.tools.cli.docs runs/claims/*.json
 
 docs: $(RUN_READY) ## write docs/messages.md and docs/command-line.md again, from DBC and program
-	.venv/bin/python -m tools.docs
+	.venv/bin/python -m ato_hil.tools.cli.docs
 
 # The viewer draws them without a screen, with Vulkan in software: mesa-vulkan-drivers is for this.
 pictures: $(RUN_READY) ## draw the screenshots of the viewer in docs/ again

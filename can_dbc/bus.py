@@ -3,8 +3,8 @@
 | name | bus |
 | --- | --- |
 | `auto` | vcan0 where it exists, else a private vcan with ample buffers, else the embedded hub |
-| `hub`, `hub:CHANNEL` | the embedded hub (`can_dbc.hub`); the default channel is vcan0 |
-| `vcan`, `vcan:CHANNEL` | a private vcan in a network namespace of its own (`can_dbc.socketcan`) |
+| `hub`, `hub:CHANNEL` | the embedded hub (`can_dbc/hub.py`); the default channel is vcan0 |
+| `vcan`, `vcan:CHANNEL` | a private vcan in a namespace of its own (`can_dbc/socketcan.py`) |
 | `socketcan:NAME` | the network interface NAME of the Linux kernel |
 | `INTERFACE:CHANNEL` | any other interface of python-can |
 
@@ -23,10 +23,16 @@ from typing import Any
 
 import can
 
-from can_dbc import private_vcan_server
-from can_dbc.hub import DEFAULT_CHANNEL, FOREIGN, HubBus
-from can_dbc.hub_server import ERROR, EXTENDED, REMOTE
-from can_dbc.socketcan import FRAME_COST_BYTES, PrivateVcanBus, SocketBus, receive_buffer_bytes
+from ato_hil.can_dbc import private_vcan_server
+from ato_hil.can_dbc.errors import InputError
+from ato_hil.can_dbc.hub import DEFAULT_CHANNEL, FOREIGN, HubBus
+from ato_hil.can_dbc.hub_server import ERROR, EXTENDED, REMOTE
+from ato_hil.can_dbc.socketcan import (
+    FRAME_COST_BYTES,
+    PrivateVcanBus,
+    SocketBus,
+    receive_buffer_bytes,
+)
 
 __all__ = [
     "FOREIGN",
@@ -60,7 +66,7 @@ _AMPLE_BUFFER_BYTES = 8 << 20  # some 11 000 frames; recent kernels (6.18) give 
 _MAX_FRAMES = 1024  # per call of recv_frames, so that it returns under any load
 
 
-class BusError(ValueError):
+class BusError(InputError):
     """A bus cannot be had; one line that names it and says why."""
 
 

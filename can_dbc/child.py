@@ -1,4 +1,5 @@
-"""What the node processes share: they end with their parent, and they speak to it in JSON lines."""
+"""What the processes of ours share: how they are started, that they end with their parent, and that
+they speak to it in JSON lines."""
 
 from __future__ import annotations
 
@@ -7,8 +8,28 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
+
+
+def python(*arguments: str) -> list[str]:
+    """The command of a child in Python: what lies in the user's folder is not imported (`-P`)."""
+    return [sys.executable, "-P", *arguments]
+
+
+@contextmanager
+def safe_path() -> Iterator[None]:
+    """The same for children that a library starts meanwhile, as a pool of processes does."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 class Stop:

@@ -16,7 +16,8 @@ import cantools
 import numpy as np
 from cantools.database import Database
 
-from can_dbc.step import dbc_path, int64, step
+from ato_hil.can_dbc.errors import InputError
+from ato_hil.can_dbc.step import dbc_path, int64, step
 
 HEADER = ("Crc", "Counter", "DataIdNibble")
 
@@ -50,7 +51,7 @@ NEEDED: dict[str, tuple[str, ...]] = {
 }
 
 
-class DbcError(ValueError):
+class DbcError(InputError):
     """The DBC does not define the interface; the message names file, message and signal."""
 
 

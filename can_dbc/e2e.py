@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
+from ato_hil.can_dbc.step import int64, step
 
 POLYNOMIAL = 0x1D
 COUNTER_PERIOD = 15  # the counter runs 0..14

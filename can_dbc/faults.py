@@ -36,8 +36,14 @@ from typing import Annotated, Any, NamedTuple, get_args
 
 import msgspec
 
-from can_dbc import e2e
-from can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGES, database, word_of
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import (
+    INDEX_OF_FRAME_ID,
+    MESSAGES,
+    database,
+    word_of,
+)
+from ato_hil.can_dbc.errors import InputError
 
 CONTROLLER, PLANT = "controller", "plant"
 RECEIVERS = (PLANT, CONTROLLER)
@@ -47,7 +53,7 @@ PLAN_FILE = "faults.msgpack"
 SOURCE_FILE = "faults.toml"
 WIRE_FRAMES = 37  # of 135 bits that 500 kbit/s carry in 10 ms
 
-Frame = tuple[int, int]  # identifier and payload, as can_dbc.bus moves them
+Frame = tuple[int, int]  # identifier and payload, as ato_hil.can_dbc.bus moves them
 Seconds = Annotated[float, msgspec.Meta(ge=0)]
 Tick = Annotated[int, msgspec.Meta(ge=0)]
 Few = Annotated[int, msgspec.Meta(ge=0, le=10_000)]
@@ -60,7 +66,7 @@ _BY_NAME = {message.name: message for message in MESSAGES}
 _BY_ID = {message.frame_id: message for message in MESSAGES}
 
 
-class FaultError(ValueError):
+class FaultError(InputError):
     """The file of faults is wrong; one line that names file and key."""
 
 

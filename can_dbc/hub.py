@@ -2,7 +2,7 @@
 
 The processes of one user that open the same channel exchange frames with the semantics of a Linux
 vcan interface, where the kernel has none. The first node starts the hub process
-(`can_dbc.hub_server`, which also describes the protocol), the last one to leave ends it.
+(`ato_hil.can_dbc.hub_server`, which also describes the protocol), the last one to leave ends it.
 """
 
 import contextlib
@@ -21,8 +21,8 @@ from typing import Any
 import can
 from can.typechecking import CanFilters
 
-from can_dbc import hub_server, rendezvous
-from can_dbc.hub_server import (
+from ato_hil.can_dbc import hub_server, rendezvous
+from ato_hil.can_dbc.hub_server import (
     BITRATE_SWITCH,
     ERROR,
     ERROR_STATE,

@@ -1,7 +1,7 @@
 """The hub process of the embedded CAN bus: passes every frame of a channel to all its other nodes.
 
-Started by the first node of a channel (`can_dbc.hub`), which hands over the listening socket as
-standard input: `python hub_server.py SOCKETPATH`. It needs nothing but the standard library, so
+Started by the first node of a channel (`hub.py`), which hands over the listening socket as standard
+input: `python hub_server.py SOCKETPATH`. It needs nothing but the standard library, so
 that it starts in tens of milliseconds. It ends by itself `LINGER_S` after its last node has left.
 
 Behaviour of the bus (that of a Linux vcan interface):

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc import e2e
-from can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGE_COUNT, MESSAGES
-from can_dbc.faults import Receiver
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGE_COUNT, MESSAGES
+from ato_hil.can_dbc.faults import Receiver
 
 
 def fresh_frames(mailboxes: np.ndarray) -> list[tuple[int, int]]:

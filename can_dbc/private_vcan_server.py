@@ -1,6 +1,6 @@
 """The process that keeps a private vcan: a network namespace with one vcan interface in it.
 
-Started by the first node of a channel (`can_dbc.socketcan`), which hands over the listening
+Started by the first node of a channel (`ato_hil.can_dbc.socketcan`), which hands over the listening
 socket as standard input: `python private_vcan_server.py SOCKETPATH`. The interface is called what
 stands before the `+` in the socket's name. It needs nothing but the standard library and no
 privileges: a user namespace of its own gives it the right to a network namespace, and netlink makes
@@ -63,7 +63,7 @@ class NoVcanError(Exception):
 
 def main() -> None:
     """Make the network, become a daemon, then hand out sockets until all nodes have left."""
-    from can_dbc.hub_server import serve_as_daemon
+    from ato_hil.can_dbc.hub_server import serve_as_daemon
 
     if len(sys.argv) == 1:
         try:
@@ -173,5 +173,5 @@ def serve(listener: socket.socket) -> None:
 
 if __name__ == "__main__":
     # Started by file name, without site packages: only the standard library is on the path.
-    sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+    sys.path.insert(0, str(Path(__file__).absolute().parents[2]))
     main()

@@ -4,7 +4,7 @@
 needs no privileges. For a node whose receive buffer is full the kernel drops frames; it counts
 them, and `frames_lost` reads that.
 
-**The private vcan.** A server process (`can_dbc.private_vcan_server`) lives in a user and a network
+**The private vcan.** A server process (`private_vcan_server.py`) lives in a user and a network
 namespace with a vcan in it, and passes raw CAN sockets that were made there to the nodes. The nodes
 themselves stay where they are: they see the usual network, so that a viewer can reach the recorder,
 they may have threads, and any process of the same user joins by the channel's name, as on the hub.
@@ -27,8 +27,13 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 from can.typechecking import CanFilters
 
-from can_dbc import private_vcan_server, rendezvous
-from can_dbc.hub import DEFAULT_CHANNEL, EXACT_BELOW_S, FOREIGN, ready
+from ato_hil.can_dbc import private_vcan_server, rendezvous
+from ato_hil.can_dbc.hub import (
+    DEFAULT_CHANNEL,
+    EXACT_BELOW_S,
+    FOREIGN,
+    ready,
+)
 
 SERVER = rendezvous.Server("atovcan", "private vcan", "+vcan.v1.sock", private_vcan_server)
 
@@ -91,7 +96,7 @@ class SocketBus(SocketcanBus):
         """Receive the frames that have come, or wait for the first.
 
         :param timeout: how many seconds to wait; None waits for ever.
-        :return: as `can_dbc.bus.recv_frames`.
+        :return: as `ato_hil.can_dbc.bus.recv_frames`.
         :raises can.CanOperationError: the interface is gone or down.
         """
         frames: list[tuple[int, int]] = []

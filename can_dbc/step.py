@@ -108,8 +108,7 @@ def source_digest(package: str = "tools") -> str:
     """Digest of every source that a step of `package` can depend on, the DBC and the compiler; a
     step from elsewhere may depend on all four packages, as one of `tools`."""
     root = Path(__file__).resolve().parent.parent
-    packages = IMPORTS.get(package, IMPORTS["tools"])
-    files = sorted(path for name in packages for path in (root / name).rglob("*.py"))
+    files = sorted(path for name in IMPORTS[package] for path in (root / name).rglob("*.py"))
     parts = [f"{path.relative_to(root)}:{_file_digest(str(path))}" for path in files]
     parts.append(_file_digest(str(dbc_path())))
     parts.append(numba.__version__)
@@ -126,11 +125,18 @@ def cache_directory(package: str = "tools") -> Path:
     return Path(base) / "ato-hil" / source_digest(package)
 
 
+def package_of(function: Any) -> str:
+    """The package of ours that a function stands in, `tools` for one from elsewhere."""
+    root, _, rest = str(function.__module__).partition(".")
+    package = rest.partition(".")[0]
+    return package if root == "ato_hil" and package in IMPORTS else "tools"
+
+
 def _stable_identity(function: Any) -> str:
     """A name that is equal in every process: numba's own is random, and closures over steps would
     miss the cache."""
     source = inspect.getsourcefile(function) or ""
-    sources = source_digest(function.__module__.partition(".")[0])
+    sources = source_digest(package_of(function))
     parts = [function.__module__, function.__qualname__, _file_digest(source), sources]
     for cell in function.__closure__ or ():
         parts.append(str(getattr(cell.cell_contents, "_uuid", cell.cell_contents)))
@@ -153,7 +159,7 @@ def step(function: Any) -> Any:
     """Compile `function` as an allocation-free step; in interpreted mode return it as it is."""
     if INTERPRETED:
         return function
-    numba.config.CACHE_DIR = str(cache_directory(function.__module__.partition(".")[0]))
+    numba.config.CACHE_DIR = str(cache_directory(package_of(function)))
     compiled = numba.njit(
         nogil=True, error_model="numpy", cache=True, boundscheck=False, _nrt=False
     )(function)

@@ -18,8 +18,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from can_dbc import e2e
-from controller import (
+from ato_hil.can_dbc import e2e
+from ato_hil.controller import (
     distribution,
     firmware,
     gradient_map,
@@ -30,9 +30,21 @@ from controller import (
     rebasing,
     reference,
 )
-from controller.q import INT32_MAX, INT32_MIN, Q_ACCELERATION, Q_FORCE, Q_POSITION, Q_SPEED
-from controller.quantise import CalibrationError, Recall, Vehicle, fixed
-from controller.registry import law_label, law_number, load_law
+from ato_hil.controller.q import (
+    INT32_MAX,
+    INT32_MIN,
+    Q_ACCELERATION,
+    Q_FORCE,
+    Q_POSITION,
+    Q_SPEED,
+)
+from ato_hil.controller.quantise import (
+    CalibrationError,
+    Recall,
+    Vehicle,
+    fixed,
+)
+from ato_hil.controller.registry import law_label, law_number, load_law
 
 FORMAT = "ato-hil calibration 1"
 AGE_MAX_TICKS = 1000

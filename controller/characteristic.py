@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.q import INT32_MAX, round_shift
-from controller.quantise import Vehicle, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.q import INT32_MAX, round_shift
+from ato_hil.controller.quantise import Vehicle, fixed
 
 PARAMS = np.dtype(
     [

@@ -24,9 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.q import Q_FORCE, round_shift, sat32
-from controller.quantise import CalibrationError
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.q import Q_FORCE, round_shift, sat32
+from ato_hil.controller.quantise import CalibrationError
 
 CARS_MAX = 8
 ROWS = CARS_MAX + 1

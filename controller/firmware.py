@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc import e2e
-from can_dbc.codec import (
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import (
     ATO_ESTIMATE,
     ATO_RADIO,
     ATO_STATUS,
@@ -40,8 +40,8 @@ from can_dbc.codec import (
     put,
     saturate,
 )
-from can_dbc.step import int64, step
-from controller import (
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller import (
     distribution,
     gradient_map,
     guard,
@@ -51,7 +51,7 @@ from controller import (
     rebasing,
     reference,
 )
-from controller.interface import (
+from ato_hil.controller.interface import (
     AHEAD,
     ARMED,
     BEHIND,
@@ -75,7 +75,7 @@ from controller.interface import (
     RUNNING,
     TRACTION,
 )
-from controller.q import (
+from ato_hil.controller.q import (
     Q_ACCELERATION,
     Q_FORCE,
     Q_POSITION,

@@ -15,9 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.q import INT32_MAX, clamp, round_shift, sat32
-from controller.quantise import CalibrationError, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.q import (
+    INT32_MAX,
+    clamp,
+    round_shift,
+    sat32,
+)
+from ato_hil.controller.quantise import CalibrationError, fixed
 
 SECTIONS_MAX = 128
 

@@ -34,8 +34,8 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.interface import (
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.interface import (
     FAULT_ATP,
     FAULT_BARRIER,
     FAULT_CONTROL_LOST,
@@ -58,7 +58,7 @@ from controller.interface import (
     GUARD_NORMAL,
     GUARD_SERVICE_BRAKE,
 )
-from controller.q import clamp, sat32
+from ato_hil.controller.q import clamp, sat32
 
 # What the guard does about a fault until the next run begins; normal: it is reported, no more.
 REACTIONS = {

@@ -26,8 +26,14 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.q import INT32_MAX, clamp, divide_round, round_shift, sat32
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.q import (
+    INT32_MAX,
+    clamp,
+    divide_round,
+    round_shift,
+    sat32,
+)
 
 WORDS_MAX = 22
 AHEAD_WORDS = 2

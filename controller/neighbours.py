@@ -23,16 +23,22 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from can_dbc.codec import (
+from ato_hil.can_dbc.codec import (
     NEIGHBOUR_AHEAD_MOTION,
     NEIGHBOUR_AHEAD_POSITION,
     binary_exponent,
     get,
 )
-from can_dbc.step import int64, step
-from controller.interface import SIDES
-from controller.q import Q_POSITION, Q_SPEED, clamp, round_shift, sat32
-from controller.quantise import CalibrationError, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.interface import SIDES
+from ato_hil.controller.q import (
+    Q_POSITION,
+    Q_SPEED,
+    clamp,
+    round_shift,
+    sat32,
+)
+from ato_hil.controller.quantise import CalibrationError, fixed
 
 HISTORY = 256  # ticks, a power of two
 

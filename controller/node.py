@@ -12,13 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.codec import mailboxes
-from can_dbc.step import INTERPRETED, step
-from controller import memory, store
-from controller.calibration import Calibration
-from controller.firmware import build_tick, state_dtype
-from controller.interface import ARMED, ENDED, FAULTS_THAT_BLOCK_LEARNING, RUNNING
-from controller.registry import law_step, load_law
+from ato_hil.can_dbc.codec import mailboxes
+from ato_hil.can_dbc.step import INTERPRETED, step
+from ato_hil.controller import memory, store
+from ato_hil.controller.calibration import Calibration
+from ato_hil.controller.firmware import build_tick, state_dtype
+from ato_hil.controller.interface import (
+    ARMED,
+    ENDED,
+    FAULTS_THAT_BLOCK_LEARNING,
+    RUNNING,
+)
+from ato_hil.controller.registry import law_step, load_law
 
 
 @dataclass

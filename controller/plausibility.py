@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.interface import (
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.interface import (
     FAULT_POSITION_IMPLAUSIBLE,
     FAULT_PROGRESS,
     FAULT_SPEED_IMPLAUSIBLE,

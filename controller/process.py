@@ -24,23 +24,28 @@ from pathlib import Path
 import can
 import numpy as np
 
-from can_dbc import pace
-from can_dbc.bus import BusError, open_bus, recv_frames, send_frames
-from can_dbc.child import Stop, follow_parent, tell
-from can_dbc.codec import RUN_CTRL, TRAIN_POSITION, get
-from can_dbc.faults import CONTROLLER, Receiver, receiver
-from can_dbc.inbox import Inbox, fresh_frames, intact
-from controller import calibration, node, store
-from controller.interface import ARMED, ENDED, RUNNING
-from controller.quantise import CalibrationError
-from controller.registry import LawError
+from ato_hil.can_dbc import pace
+from ato_hil.can_dbc.bus import (
+    BusError,
+    open_bus,
+    recv_frames,
+    send_frames,
+)
+from ato_hil.can_dbc.child import Stop, follow_parent, tell
+from ato_hil.can_dbc.codec import RUN_CTRL, TRAIN_POSITION, get
+from ato_hil.can_dbc.faults import CONTROLLER, Receiver, receiver
+from ato_hil.can_dbc.inbox import Inbox, fresh_frames, intact
+from ato_hil.controller import calibration, node, store
+from ato_hil.controller.interface import ARMED, ENDED, RUNNING
+from ato_hil.controller.quantise import CalibrationError
+from ato_hil.controller.registry import LawError
 
 RECEIVE_TIMEOUT_S = 0.1
 DRIFT = 10_000  # two clocks drift apart by less than a period in so many
 CATCH_UP_MAX = 100  # periods computed at once
 TICKS_HALF = 1 << 15  # TRAIN_POSITION.Tick has 16 bits
 
-Frame = tuple[int, int]  # identifier and payload, as can_dbc.bus moves them
+Frame = tuple[int, int]  # identifier and payload, as ato_hil.can_dbc.bus moves them
 
 
 def inbox_of(controller: node.Controller, faults: Receiver | None = None) -> Inbox:
@@ -222,7 +227,9 @@ def run_period(controller: node.Controller, inbox: Inbox, clock: Clock, now_ns: 
 
 def main() -> int:
     """Exit status 0 after SIGTERM, 1 for bad input, 2 if the bus is gone."""
-    parser = argparse.ArgumentParser(prog="python -m controller.process", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m ato_hil.controller.process", description=__doc__
+    )
     parser.add_argument("--calibration", type=Path, required=True)
     parser.add_argument("--bus", required=True)
     parser.add_argument("--memory", type=Path)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from can_dbc.step import int64, step
+from ato_hil.can_dbc.step import int64, step
 
 # Quantity: LSB = 2**-Q of its unit; int32 unless said otherwise.
 Q_POSITION = 15  # m: +-65.5 km, 31 um

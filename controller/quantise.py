@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ato_hil.can_dbc.errors import InputError
 
-class CalibrationError(ValueError):
+
+class CalibrationError(InputError):
     """A number of the scenario has no integer form; the message names the key, the value and the
     range."""
 

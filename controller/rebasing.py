@@ -34,11 +34,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller import separation
-from controller.interface import AHEAD, BEHIND, SIDES
-from controller.q import clamp, round_shift, sat32
-from controller.quantise import fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller import separation
+from ato_hil.controller.interface import AHEAD, BEHIND, SIDES
+from ato_hil.controller.q import clamp, round_shift, sat32
+from ato_hil.controller.quantise import fixed
 
 STANDSTILL = 1 << 14  # m/s, Q24: 1 mm/s
 Q_OFFSET = 40  # m

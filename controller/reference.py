@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.q import round_shift, sat32
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.q import round_shift, sat32
 
 SEGMENT = np.dtype([("ticks", np.int32), ("jerk", np.int32)], align=True)
 

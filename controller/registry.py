@@ -12,13 +12,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from can_dbc.codec import choices
-from controller import laws
+from ato_hil.can_dbc.codec import choices
+from ato_hil.can_dbc.errors import InputError
+from ato_hil.controller import laws
 
 PARTS = ("PARAMS", "STATE", "WORDS", "ESTIMATES", "Gains", "calibrate")  # of a law's module
 
 
-class LawError(ValueError):
+class LawError(InputError):
     """There is no such law, or its file is none; one line that says what was expected."""
 
 
@@ -43,7 +44,7 @@ def load_law(name: str) -> ModuleType:
         return _load_file(Path(name))
     if name not in law_names():
         raise LawError(f"law {name!r} is unknown, expected one of {', '.join(law_names())}")
-    return importlib.import_module(f"controller.laws.{name.replace('-', '_')}")
+    return importlib.import_module(f"ato_hil.controller.laws.{name.replace('-', '_')}")
 
 
 def _load_file(path: Path) -> ModuleType:

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.interface import SIDES
-from controller.q import clamp, round_shift, sat32
-from controller.quantise import CalibrationError, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.interface import SIDES
+from ato_hil.controller.q import clamp, round_shift, sat32
+from ato_hil.controller.quantise import CalibrationError, fixed
 
 PARAMS = np.dtype(
     [

@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.calibration import Calibration
-from controller.registry import law_label
+from ato_hil.can_dbc.errors import InputError
+from ato_hil.controller.calibration import Calibration
+from ato_hil.controller.registry import law_label
 
 MAGIC = b"ATOLEARN"
 VERSION = 1
@@ -24,7 +25,7 @@ VERSION = 1
 _HEADER = struct.Struct("<8sIIIII32s64s")
 
 
-class MemoryFileError(ValueError):
+class MemoryFileError(InputError):
     """The file is no learning memory for this law and scenario; the message names file and
     reason."""
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
+from ato_hil.can_dbc.step import int64, step
 
 CHANNELS_MAX = 8
 DELAY_MAX = 16

@@ -62,10 +62,10 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from plant_sim.brakes import Brake, Step, ticks_of
-from plant_sim.track import section_at
-from plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.plant_sim.brakes import Brake, Step, ticks_of
+from ato_hil.plant_sim.track import section_at
+from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 NONE, MARGIN, ETCS = 0, 1, 2
 SUPERVISIONS = {"none": NONE, "margin": MARGIN, "etcs": ETCS}

@@ -17,8 +17,8 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from plant_sim.actuator import CHANNELS_MAX
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.plant_sim.actuator import CHANNELS_MAX
 
 STEPS_MAX = 8
 

@@ -1,5 +1,5 @@
 """Failures of sensors and actuators in a time window, from a file of faults: `[[sensor]]` and
-`[[actuator]]` tables beside the `[[bus]]` of can_dbc.faults.
+`[[actuator]]` tables beside the `[[bus]]` of ato_hil.can_dbc.faults.
 
     [[sensor]]
     kind = "drift"          # stuck, drift, offset, noise; slip needs no quantity
@@ -27,8 +27,15 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.faults import SOURCE_FILE, FaultError, Planned, Window, table, ticks_of
-from can_dbc.step import int64, step
+from ato_hil.can_dbc.faults import (
+    SOURCE_FILE,
+    FaultError,
+    Planned,
+    Window,
+    table,
+    ticks_of,
+)
+from ato_hil.can_dbc.step import int64, step
 
 FAILURES_MAX = 16
 CARS_MAX = 8

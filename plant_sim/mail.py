@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from can_dbc import e2e
-from can_dbc.step import int64, step
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.step import int64, step
 
 
 @step

@@ -17,7 +17,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from plant_sim.profile import INT32, POSITION_UNIT_M, SEGMENT, Profile, evaluate, unit_factors
+from ato_hil.can_dbc.errors import InputError
+from ato_hil.plant_sim.profile import (
+    INT32,
+    POSITION_UNIT_M,
+    SEGMENT,
+    Profile,
+    evaluate,
+    unit_factors,
+)
 
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
@@ -30,7 +38,7 @@ SINUSOID_POSITION_M = 1e-3  # largest deviation of a sinusoidal ramp's table fro
 SINUSOID_SPEED_M_S = 1e-4
 
 
-class PlanError(ValueError):
+class PlanError(InputError):
     """A plan that contradicts itself or breaks a limit; the message is one line."""
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc import e2e
-from can_dbc.codec import (
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import (
     ATO_STATUS,
     ATP_LIMIT,
     CAR_FORCE_1,
@@ -30,9 +30,15 @@ from can_dbc.codec import (
     put,
     saturate,
 )
-from can_dbc.step import int64, step
-from plant_sim import actuator, atp, brakes, failures, radio
-from plant_sim.mail import received
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.plant_sim import (
+    actuator,
+    atp,
+    brakes,
+    failures,
+    radio,
+)
+from ato_hil.plant_sim.mail import received
 
 IDLE, ARMED, RUNNING, ENDED = 0, 1, 2, 3
 REAL_TIME = 1  # RUN_CTRL.Pace; 0 is the lockstep

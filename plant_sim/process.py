@@ -25,14 +25,19 @@ from typing import Any
 import can
 import numpy as np
 
-from can_dbc import pace
-from can_dbc.bus import BusError, open_bus, recv_frames, send_frames
-from can_dbc.child import Stop, follow_parent, tell
-from can_dbc.codec import ATO_STATUS, FORCE_CMD, get
-from can_dbc.faults import PLANT, receiver
-from can_dbc.inbox import Inbox, fresh_frames, intact
-from plant_sim import failures, plant, world
-from plant_sim.scenario import ScenarioError, load
+from ato_hil.can_dbc import pace
+from ato_hil.can_dbc.bus import (
+    BusError,
+    open_bus,
+    recv_frames,
+    send_frames,
+)
+from ato_hil.can_dbc.child import Stop, follow_parent, tell
+from ato_hil.can_dbc.codec import ATO_STATUS, FORCE_CMD, get
+from ato_hil.can_dbc.faults import PLANT, receiver
+from ato_hil.can_dbc.inbox import Inbox, fresh_frames, intact
+from ato_hil.plant_sim import failures, plant, world
+from ato_hil.plant_sim.scenario import ScenarioError, load
 
 TICK_START = FORCE_CMD.Tick.start
 REPEAT_S = 0.1  # RUN_CTRL outside a run
@@ -73,7 +78,7 @@ def port_of(
     faults: Path | None,
     fails: Sequence[failures.AnyFailure],
 ) -> Port:
-    """The port of a train; `faults` is the folder of `can_dbc.faults.receiver`."""
+    """The port of a train; `faults` is the folder of `ato_hil.can_dbc.faults.receiver`."""
     counters = here.state["node"]["received"][train]
     planned = failures.planned(fails, train, here.members[train].scenario.period_s)
     return Port(bus, Inbox(here.rx[train], counters, receiver(faults, PLANT, train, planned)))
@@ -350,7 +355,9 @@ def one_run(
 def main() -> int:
     """Exit status 0 after all runs or SIGTERM, 1 for bad input, 2 if the bus is gone, 3 for a
     silent node."""
-    parser = argparse.ArgumentParser(prog="python -m plant_sim.process", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m ato_hil.plant_sim.process", description=__doc__
+    )
     parser.add_argument("--scenario", required=True)
     parser.add_argument("--bus", required=True, action="append", help="once for each train")
     parser.add_argument("--seed", type=int, required=True)

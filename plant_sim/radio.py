@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc import e2e
-from can_dbc.codec import (
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import (
     ATO_RADIO,
     NEIGHBOUR_AHEAD_MOTION,
     NEIGHBOUR_AHEAD_POSITION,
@@ -26,9 +26,9 @@ from can_dbc.codec import (
     put,
     saturate,
 )
-from can_dbc.step import dbc_path, int64, step
-from plant_sim.line import PACKETS_MAX
-from plant_sim.mail import received
+from ato_hil.can_dbc.step import dbc_path, int64, step
+from ato_hil.plant_sim.line import PACKETS_MAX
+from ato_hil.plant_sim.mail import received
 
 REPEAT_TICKS = 10
 AHEAD, BEHIND = 0, 1

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
@@ -21,13 +22,20 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from plant_sim.actuator import Actuator
-from plant_sim.atp import Atp, braking_fault
-from plant_sim.line import Line
-from plant_sim.planner import PlanError, ProfilePlan, plan_profile
-from plant_sim.profile import Profile, displaced, evaluate, rate_of, stretched
-from plant_sim.track import Track, sections
-from plant_sim.trains import couplers, lumped, point
+from ato_hil.can_dbc.errors import InputError
+from ato_hil.plant_sim.actuator import Actuator
+from ato_hil.plant_sim.atp import Atp, braking_fault
+from ato_hil.plant_sim.line import Line
+from ato_hil.plant_sim.planner import PlanError, ProfilePlan, plan_profile
+from ato_hil.plant_sim.profile import (
+    Profile,
+    displaced,
+    evaluate,
+    rate_of,
+    stretched,
+)
+from ato_hil.plant_sim.track import Track, sections
+from ato_hil.plant_sim.trains import couplers, lumped, point
 
 FOLDER = Path(__file__).with_name("scenarios")
 # The train models; key `train.model` chooses. Each file has a Train, PARAMS, STATE, calibrate, and
@@ -46,7 +54,7 @@ Share = Annotated[float, msgspec.Meta(ge=0, le=2)]
 MassError = Annotated[float, msgspec.Meta(ge=-0.5, le=1)]
 
 
-class ScenarioError(ValueError):
+class ScenarioError(InputError):
     """The scenario is unknown or wrong; the message names file, key and what was expected."""
 
 
@@ -426,3 +434,16 @@ def _check(path: str, scenario: Scenario) -> None:
     fault = braking_fault(scenario.atp, sections(scenario.track))
     if fault:
         raise ScenarioError(f"{path}: key {fault}")
+
+
+def shortened(loaded: Loaded, ticks: int) -> Loaded:
+    """The scenario's first `ticks` control periods; 0 or more than it has: all."""
+    if not 0 < ticks < loaded.ticks:
+        return loaded
+    profile = loaded.profile
+    arrays = {
+        name: value[:ticks]
+        for name, value in vars(profile).items()
+        if isinstance(value, np.ndarray) and len(value) == loaded.ticks
+    }
+    return msgspec.structs.replace(loaded, profile=replace(profile, **arrays))

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
+from ato_hil.can_dbc.step import int64, step
 
 Place = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 Resistance = Annotated[float, msgspec.Meta(ge=-1e3, le=1e3)]

@@ -12,14 +12,28 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.codec import MAILBOX, MESSAGE_COUNT, NEIGHBOUR_AHEAD_POSITION
-from can_dbc.step import INTERPRETED, step
-from plant_sim import actuator, atp, brakes, failures, plant, track
-from plant_sim.line import Fault
-from plant_sim.profile import RATE_ONE, rate_of, stretched_ticks
-from plant_sim.scenario import MODELS, Loaded, RunLength, Scenario, at_rate, members
-from plant_sim.trains import couplers, point
-from plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
+from ato_hil.can_dbc.codec import MAILBOX, MESSAGE_COUNT, NEIGHBOUR_AHEAD_POSITION
+from ato_hil.can_dbc.step import INTERPRETED, step
+from ato_hil.plant_sim import (
+    actuator,
+    atp,
+    brakes,
+    failures,
+    plant,
+    track,
+)
+from ato_hil.plant_sim.line import Fault
+from ato_hil.plant_sim.profile import RATE_ONE, rate_of, stretched_ticks
+from ato_hil.plant_sim.scenario import (
+    MODELS,
+    Loaded,
+    RunLength,
+    Scenario,
+    at_rate,
+    members,
+)
+from ato_hil.plant_sim.trains import couplers, point
+from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 # Chance: what a random number is drawn for; each gets a stream of its own, in each train.
 SPEED_NOISE, DISTURBANCE, LOST_AHEAD, LOST_BEHIND = 0, 1, 2, 3

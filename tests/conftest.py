@@ -10,7 +10,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from can_dbc import hub_server
+from ato_hil.can_dbc import hub_server
 
 # No deadline: the first example of a test pays for compiling the step.
 # In CI the examples are the same each time.

@@ -18,6 +18,14 @@ MAY_IMPORT = {
     "plant_sim": {"can_dbc"},
     "tools": {"can_dbc", "controller", "plant_sim"},
 }
+ROOMS = (
+    {"runs"},
+    {"trace"},
+    {"session"},
+    {"campaigns", "papers"},
+    {"verify", "reports", "bench"},
+    {"cli"},
+)
 MODULES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))
 
 FLOAT_NAMES = {"float", "round", "float16", "float32", "float64", "double", "math"}
@@ -34,13 +42,19 @@ def relative(path: Path) -> str:
 
 
 def imported_packages(source: str) -> set[str]:
-    """Top-level names that `source` imports, wherever in the module the import stands."""
+    """Our packages that `source` imports, and other top-level names."""
+    names = [name.split(".") for name in imported(source)]
+    return {parts[1] if parts[0] == "ato_hil" else parts[0] for parts in names}
+
+
+def imported(source: str) -> set[str]:
+    """Dotted names that `source` imports, wherever in the module the import stands."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            names.update(alias.name.partition(".")[0] for alias in node.names)
+            names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            names.add(node.module.partition(".")[0])
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
     return names
 
 
@@ -57,8 +71,61 @@ def test_imports_point_one_way(package):
 
 
 def test_an_import_is_seen_in_every_form():
-    source = "import a.b\nfrom c.d import x\ndef f():\n    import e as g\nfrom . import h\n"
-    assert imported_packages(source) == {"a", "c", "e"}
+    source = (
+        "import a.b\nfrom c.d import x\ndef f():\n    import e as g\nfrom . import h\n"
+        "from ato_hil.p.q import y\nfrom ato_hil import r\nimport ato_hil.s\n"
+    )
+    assert imported_packages(source) == {"a", "c", "e", "p", "r", "s"}
+
+
+def room(path: Path) -> str:
+    """The room of a module in tools/."""
+    return path.relative_to(ROOT / "tools").parts[0]
+
+
+def test_no_room_of_tools_imports_from_beside_or_above():
+    paths = [path for path in MODULES if path.is_relative_to(ROOT / "tools")]
+    modules = [path for path in paths if path.parent != ROOT / "tools"]
+    level = {name: number for number, names in enumerate(ROOMS) for name in names}
+    assert {room(path) for path in modules} == set(level)
+    found = {
+        f"{relative(path)} imports {name}"
+        for path in modules
+        for name in imported(path.read_text(encoding="utf-8"))
+        if name.startswith("ato_hil.tools.")
+        and (there := name.split(".")[2]) != room(path)
+        and level[there] >= level[room(path)]
+    }
+    assert not found
+
+
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_no_circle(package):
+    names = {module_name(path): path for path in MODULES if path.is_relative_to(ROOT / package)}
+    needs = {
+        name: {
+            owner
+            for each in imported(path.read_text(encoding="utf-8"))
+            if (owner := each if each in names else each.rpartition(".")[0]) in names
+        }
+        - {name}
+        for name, path in names.items()
+    }
+    assert not circle(needs)
+
+
+def circle(needs: dict[str, set[str]]) -> list[str]:
+    """Modules that need each other; none if there is an order in which all can be loaded."""
+    left = dict(needs)
+    while ready := [name for name, what in left.items() if not what & left.keys()]:
+        for name in ready:
+            del left[name]
+    return sorted(left)
+
+
+def test_a_circle_is_seen():
+    assert circle({"a": {"b"}, "b": set(), "c": {"a"}}) == []
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["a", "b", "c"]
 
 
 # Steps stay integer.
@@ -91,7 +158,7 @@ def float_uses(function: ast.FunctionDef) -> list[str]:
 
 def module_name(path: Path) -> str:
     parts = path.relative_to(ROOT).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+    return ".".join(("ato_hil", *(parts[:-1] if parts[-1] == "__init__" else parts)))
 
 
 CONTROLLER_MODULES = [path for path in MODULES if path.is_relative_to(ROOT / "controller")]

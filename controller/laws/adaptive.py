@@ -30,10 +30,15 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.laws.cailc import errors
-from controller.q import clamp, divide_round, round_shift, sat32
-from controller.quantise import Vehicle, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.laws.cailc import errors
+from ato_hil.controller.q import (
+    clamp,
+    divide_round,
+    round_shift,
+    sat32,
+)
+from ato_hil.controller.quantise import Vehicle, fixed
 
 PARAMS = np.dtype(
     [

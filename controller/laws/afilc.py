@@ -36,11 +36,16 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.interface import FAULT_BARRIER
-from controller.laws.cailc import barrier
-from controller.q import clamp, exp2_minus, round_shift, sat32
-from controller.quantise import Vehicle, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.interface import FAULT_BARRIER
+from ato_hil.controller.laws.cailc import barrier
+from ato_hil.controller.q import (
+    clamp,
+    exp2_minus,
+    round_shift,
+    sat32,
+)
+from ato_hil.controller.quantise import Vehicle, fixed
 
 RULES = 4
 W_MIN = 2.0**-8  # of 1 - (phi/kv)^2: the sampled phi can step over kv

@@ -31,12 +31,17 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.interface import FAULT_BARRIER
-from controller.laws.afilc import SPEED_MAX, W_MIN, CommonGains, switching
-from controller.laws.cailc import barrier
-from controller.q import clamp, round_shift, sat32
-from controller.quantise import Vehicle, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.interface import FAULT_BARRIER
+from ato_hil.controller.laws.afilc import (
+    SPEED_MAX,
+    W_MIN,
+    CommonGains,
+    switching,
+)
+from ato_hil.controller.laws.cailc import barrier
+from ato_hil.controller.q import clamp, round_shift, sat32
+from ato_hil.controller.quantise import Vehicle, fixed
 
 PARAMS = np.dtype(
     [

@@ -17,11 +17,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.laws import cailc
-from controller.laws.cailc import errors, force, increments
-from controller.q import INT32_MAX, INT32_MIN, clamp, sat32
-from controller.quantise import Vehicle, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.laws import cailc
+from ato_hil.controller.laws.cailc import errors, force, increments
+from ato_hil.controller.q import (
+    INT32_MAX,
+    INT32_MIN,
+    clamp,
+    sat32,
+)
+from ato_hil.controller.quantise import Vehicle, fixed
 
 PARAMS = cailc.PARAMS
 STATE = cailc.STATE

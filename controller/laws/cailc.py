@@ -33,10 +33,15 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.interface import FAULT_BARRIER
-from controller.q import clamp, round_shift, sat32, sin_half_pi
-from controller.quantise import Vehicle, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.interface import FAULT_BARRIER
+from ato_hil.controller.q import (
+    clamp,
+    round_shift,
+    sat32,
+    sin_half_pi,
+)
+from ato_hil.controller.quantise import Vehicle, fixed
 
 THETA_Q = (34, 39, 43)
 GAMMA_Q = (30, 43, 49)

@@ -53,10 +53,15 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller import characteristic
-from controller.q import INT32_MAX, clamp, round_shift, sat32
-from controller.quantise import Vehicle, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller import characteristic
+from ato_hil.controller.q import (
+    INT32_MAX,
+    clamp,
+    round_shift,
+    sat32,
+)
+from ato_hil.controller.quantise import Vehicle, fixed
 
 ESTIMATE_Q = (20, 30, 36)  # of theta in N/t with V in km/h
 STANDSTILL = round(0.01 * 2**24)  # m/s, Q24: below it the train stands

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.laws.drac import (
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.laws.drac import (
     LOOP_PARAMS,
     LOOP_STATE,
     TRACK_PARAMS,
@@ -36,8 +36,8 @@ from controller.laws.drac import (
     si,
     wanted_acceleration,
 )
-from controller.q import round_shift, sat32, sin_half_pi
-from controller.quantise import Vehicle, fixed
+from ato_hil.controller.q import round_shift, sat32, sin_half_pi
+from ato_hil.controller.quantise import Vehicle, fixed
 
 THETA_Q = (28, 40, 40)
 

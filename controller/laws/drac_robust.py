@@ -35,8 +35,8 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.laws.drac import (
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.laws.drac import (
     LOOP_PARAMS,
     LOOP_STATE,
     MODEL_ESTIMATES,
@@ -67,8 +67,13 @@ from controller.laws.drac import (
     specific_force,
     wanted_acceleration,
 )
-from controller.q import clamp, divide_round, round_shift, sat32
-from controller.quantise import CalibrationError, Vehicle, fixed
+from ato_hil.controller.q import (
+    clamp,
+    divide_round,
+    round_shift,
+    sat32,
+)
+from ato_hil.controller.quantise import CalibrationError, Vehicle, fixed
 
 ETA_MAX = 1 << 29  # 8, Q26: its square is Q52 and below 2^58
 

@@ -51,10 +51,20 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.interface import ESTIMATES_MAX
-from controller.q import clamp, divide_round, round_shift, sat32
-from controller.quantise import CalibrationError, Recall, Vehicle, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.interface import ESTIMATES_MAX
+from ato_hil.controller.q import (
+    clamp,
+    divide_round,
+    round_shift,
+    sat32,
+)
+from ato_hil.controller.quantise import (
+    CalibrationError,
+    Recall,
+    Vehicle,
+    fixed,
+)
 
 INITIAL_RUN = True  # runs are numbered from 0
 

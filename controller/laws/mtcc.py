@@ -48,11 +48,16 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller import separation
-from controller.interface import FAULT_BARRIER, SIDES
-from controller.q import INT32_MAX, clamp, round_shift, sat32
-from controller.quantise import CalibrationError, Vehicle, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller import separation
+from ato_hil.controller.interface import FAULT_BARRIER, SIDES
+from ato_hil.controller.q import (
+    INT32_MAX,
+    clamp,
+    round_shift,
+    sat32,
+)
+from ato_hil.controller.quantise import CalibrationError, Vehicle, fixed
 
 E_MAX = 1 << 30  # m, Q24: 64
 S_E_MAX = 1 << 25  # m, Q24: 2, in the adaptation

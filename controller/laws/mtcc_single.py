@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.laws.mtcc import (
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.laws.mtcc import (
     COMMON_ESTIMATES,
     COMMON_PARAMS,
     COMMON_STATE,
@@ -40,8 +40,13 @@ from controller.laws.mtcc import (
     speed_error,
     speed_of,
 )
-from controller.q import INT32_MAX, clamp, round_shift, sat32
-from controller.quantise import Vehicle, fixed
+from ato_hil.controller.q import (
+    INT32_MAX,
+    clamp,
+    round_shift,
+    sat32,
+)
+from ato_hil.controller.quantise import Vehicle, fixed
 
 THETA_MAX = round(1.9 * 2**52)
 EV_MAX = 1 << 23  # m/s, Q24: 0.5, in the adaptation

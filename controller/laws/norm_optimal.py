@@ -14,10 +14,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import step
-from controller.laws import iplc as iplc_law
-from controller.laws.iplc import iplc
-from controller.quantise import Recall, Vehicle
+from ato_hil.can_dbc.step import step
+from ato_hil.controller.laws import iplc as iplc_law
+from ato_hil.controller.laws.iplc import iplc
+from ato_hil.controller.quantise import Recall, Vehicle
 
 INITIAL_RUN = iplc_law.INITIAL_RUN
 

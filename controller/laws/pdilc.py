@@ -19,11 +19,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.laws import pid as pid_law
-from controller.laws.pid import pid
-from controller.q import clamp, round_shift, sat32
-from controller.quantise import Vehicle, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.laws import pid as pid_law
+from ato_hil.controller.laws.pid import pid
+from ato_hil.controller.q import clamp, round_shift, sat32
+from ato_hil.controller.quantise import Vehicle, fixed
 
 INITIAL_RUN = True  # runs are numbered from 0
 

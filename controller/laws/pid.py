@@ -18,9 +18,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.q import clamp, round_shift, sat32
-from controller.quantise import Vehicle, fixed
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.q import clamp, round_shift, sat32
+from ato_hil.controller.quantise import Vehicle, fixed
 
 PARAMS = np.dtype(
     [

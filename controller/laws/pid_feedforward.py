@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import int64, step
-from controller.laws.drac import (
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller.laws.drac import (
     TRACK_PARAMS,
     TRACK_STATE,
     NotNegative,
@@ -35,8 +35,8 @@ from controller.laws.drac import (
     feed_forward,
     limit,
 )
-from controller.q import clamp, round_shift, sat32
-from controller.quantise import Vehicle, fixed
+from ato_hil.controller.q import clamp, round_shift, sat32
+from ato_hil.controller.quantise import Vehicle, fixed
 
 INTEGRAL_MAX = 1 << 36
 

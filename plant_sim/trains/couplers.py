@@ -22,11 +22,18 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from plant_sim.actuator import actuate, command_cars
-from plant_sim.track import section_at
-from plant_sim.trains import lumped
-from plant_sim.trains.lumped import CARS_MAX, GRAVITY_M_S2, MOTOR, N_PER_KN, OSCILLATOR, TRAILER
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.plant_sim.actuator import actuate, command_cars
+from ato_hil.plant_sim.track import section_at
+from ato_hil.plant_sim.trains import lumped
+from ato_hil.plant_sim.trains.lumped import (
+    CARS_MAX,
+    GRAVITY_M_S2,
+    MOTOR,
+    N_PER_KN,
+    OSCILLATOR,
+    TRAILER,
+)
 
 RESISTANCE_FULL_M_S = 0.005
 BRAKE_FULL_M_S = 0.020

@@ -21,10 +21,10 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from plant_sim.actuator import actuate
-from plant_sim.actuator import command as command_actuator
-from plant_sim.track import section_at
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.plant_sim.actuator import actuate
+from ato_hil.plant_sim.actuator import command as command_actuator
+from ato_hil.plant_sim.track import section_at
 
 GRAVITY_M_S2 = 9.81
 CARS_MAX = 8

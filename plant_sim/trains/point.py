@@ -17,11 +17,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import int64, step
-from plant_sim.actuator import actuate
-from plant_sim.actuator import command as command_actuator
-from plant_sim.track import resistance_at, section_at
-from plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN, OSCILLATOR, small_rotation
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.plant_sim.actuator import actuate
+from ato_hil.plant_sim.actuator import command as command_actuator
+from ato_hil.plant_sim.track import resistance_at, section_at
+from ato_hil.plant_sim.trains.lumped import (
+    GRAVITY_M_S2,
+    N_PER_KN,
+    OSCILLATOR,
+    small_rotation,
+)
 
 
 class Resistance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from can_dbc.hub import HubBus
+from ato_hil.can_dbc.hub import HubBus
 
 TIMEOUT_S = 10.0  # of what must come
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc import private_vcan_server
-from can_dbc.bus import (
+from ato_hil.can_dbc import private_vcan_server
+from ato_hil.can_dbc.bus import (
     FOREIGN,
     BusChoice,
     BusError,
@@ -21,7 +21,7 @@ from can_dbc.bus import (
     send_frames,
     socketcan_reason,
 )
-from can_dbc.hub import HubBus
+from ato_hil.can_dbc.hub import HubBus
 
 TIMEOUT_S = 10.0
 
@@ -57,7 +57,7 @@ def can_kernel_without_vcan0(monkeypatch):
     monkeypatch.setattr(socket, "AF_CAN", 29, raising=False)  # not there on every system
     monkeypatch.setattr(socket, "CAN_RAW", 1, raising=False)
     monkeypatch.setattr(socket, "socket", CanSocket)
-    monkeypatch.setattr("can_dbc.bus.receive_buffer_bytes", lambda: 64 << 20)
+    monkeypatch.setattr("ato_hil.can_dbc.bus.receive_buffer_bytes", lambda: 64 << 20)
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ SMALL = (
 @pytest.fixture
 def small_buffers(monkeypatch):
     """A kernel that gives this user no more than it did for decades."""
-    monkeypatch.setattr("can_dbc.bus.receive_buffer_bytes", lambda: 425_984)
+    monkeypatch.setattr("ato_hil.can_dbc.bus.receive_buffer_bytes", lambda: 425_984)
 
 
 def test_auto_takes_the_hub_where_a_private_vcan_would_lose_frames(
@@ -230,7 +230,7 @@ def test_a_private_vcan_without_can(no_can_kernel):
 
 
 def test_a_private_vcan_that_cannot_be_made(monkeypatch, runtime_dir, trial):
-    monkeypatch.setattr("can_dbc.bus.socketcan_reason", lambda channel: "")
+    monkeypatch.setattr("ato_hil.can_dbc.bus.socketcan_reason", lambda channel: "")
     trial("this is why")
     assert private_vcan_reason() == "this is why"
     with pytest.raises(BusError) as failure:

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc import codec
-from can_dbc.codec import (
+from ato_hil.can_dbc import codec
+from ato_hil.can_dbc.codec import (
     ATO_ESTIMATE,
     HEADER,
     INDEX_OF_FRAME_ID,
@@ -33,7 +33,7 @@ from can_dbc.codec import (
     saturate,
     word_of,
 )
-from can_dbc.step import dbc_path
+from ato_hil.can_dbc.step import dbc_path
 
 WORDS = st.integers(-(2**63), 2**63 - 1)
 SIGNALS = [(m, s.name) for m in MESSAGES for s in database().get_message_by_name(m.name).signals]
@@ -375,7 +375,7 @@ def test_a_file_that_is_not_there_is_named(
 
 def test_the_environment_chooses_the_dbc_of_a_process(use: Any) -> None:
     path = use((" SG_ Force : 16|24@1- (0.0625,0)", " SG_ Force : 16|24@1- (0.125,0)"))
-    code = "from can_dbc.codec import FORCE_CMD; print(FORCE_CMD.Force.scale)"
+    code = "from ato_hil.can_dbc.codec import FORCE_CMD; print(FORCE_CMD.Force.scale)"
     done = subprocess.run(
         [sys.executable, "-c", code],
         env={**os.environ, "ATO_HIL_DBC": str(path)},

@@ -9,9 +9,14 @@ from e2e import p11
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc import e2e
-from can_dbc.codec import MAILBOX, MESSAGES, bytes_of, word_of
-from can_dbc.e2e import (
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import (
+    MAILBOX,
+    MESSAGES,
+    bytes_of,
+    word_of,
+)
+from ato_hil.can_dbc.e2e import (
     CORRUPT,
     COUNTER_PERIOD,
     DELTA_ANY,

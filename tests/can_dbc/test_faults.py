@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc import e2e, faults
-from can_dbc.codec import (
+from ato_hil.can_dbc import e2e, faults
+from ato_hil.can_dbc.codec import (
     ATO_STATUS,
     ATP_LIMIT,
     CAR_FORCE_1,
@@ -22,7 +22,7 @@ from can_dbc.codec import (
     TRAIN_POSITION,
     TRAIN_SPEED,
 )
-from can_dbc.faults import (
+from ato_hil.can_dbc.faults import (
     CONTROLLER,
     PLANT,
     Event,

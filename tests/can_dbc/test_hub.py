@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from can_dbc.hub import FOREIGN, HubBus
+from ato_hil.can_dbc.hub import FOREIGN, HubBus
 
 TIMEOUT_S = 10.0  # of what must come
 

@@ -17,8 +17,8 @@ from pathlib import Path
 import can
 import pytest
 
-from can_dbc import hub, hub_server, rendezvous
-from can_dbc.hub import FOREIGN, HubBus, socket_path
+from ato_hil.can_dbc import hub, hub_server, rendezvous
+from ato_hil.can_dbc.hub import FOREIGN, HubBus, socket_path
 
 TIMEOUT_S = 10.0
 
@@ -84,7 +84,7 @@ def test_what_a_slow_reader_loses_is_counted(node, hub_with, flood, caplog, fd):
     assert [payload for _, payload in arrived] == list(range(len(arrived)))  # one gap, at the end
     assert caplog.record_tuples == [
         (
-            "can_dbc.hub",
+            "ato_hil.can_dbc.hub",
             logging.WARNING,
             f"{slow.channel_info}: read too slowly, the hub dropped {slow.frames_lost} frames",
         )
@@ -249,7 +249,7 @@ def test_a_frame_ends_a_wait_however_short(node, wait_s):
 
 NODE_THAT_DIES = """
 import os, signal, sys
-from can_dbc.hub import HubBus
+from ato_hil.can_dbc.hub import HubBus
 bus = HubBus()
 bus.send_frames([(1, count) for count in range(1000)])
 os.kill(os.getpid(), signal.SIGKILL)
@@ -435,7 +435,7 @@ def test_a_hub_whose_socket_was_deleted_spares_the_next_one(node):
 
 NODE_WITHOUT_CHILDREN = """
 import os
-from can_dbc.hub import HubBus
+from ato_hil.can_dbc.hub import HubBus
 with HubBus("child") as bus:
     try:
         os.waitpid(-1, os.WNOHANG)
@@ -471,7 +471,7 @@ def test_a_hub_that_breaks_at_once(runtime_dir, monkeypatch, tmp_path):
 
 
 def test_the_hub_is_not_for_starting_by_hand(tmp_path):
-    command = [sys.executable, "-m", "can_dbc.hub_server"]
+    command = [sys.executable, "-m", "ato_hil.can_dbc.hub_server"]
     for arguments in ([], [str(tmp_path / "no.sock")]):
         done = subprocess.run(
             command + arguments,
@@ -554,7 +554,7 @@ def test_impossible_channels(runtime_dir, channel):
 
 PROCESS_OF_MANY = """
 import sys
-from can_dbc.hub import HubBus
+from ato_hil.can_dbc.hub import HubBus
 count, index = int(sys.argv[1]), int(sys.argv[2])
 bus = HubBus(sys.argv[3])
 print("open", flush=True)

@@ -7,10 +7,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc import e2e
-from can_dbc.codec import MESSAGE_COUNT, TRAIN_POSITION, TRAIN_SPEED, mailboxes
-from can_dbc.faults import CONTROLLER, Drop, Plan, Receiver
-from can_dbc.inbox import Inbox, intact
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import (
+    MESSAGE_COUNT,
+    TRAIN_POSITION,
+    TRAIN_SPEED,
+    mailboxes,
+)
+from ato_hil.can_dbc.faults import (
+    CONTROLLER,
+    Drop,
+    Plan,
+    Receiver,
+)
+from ato_hil.can_dbc.inbox import Inbox, intact
 
 LAST = 6  # counter of the last good frame
 INDEX = TRAIN_SPEED.index

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc import pace
+from ato_hil.can_dbc import pace
 
 times = st.lists(st.integers(0, 2**31 - 1), min_size=1, max_size=200)
 

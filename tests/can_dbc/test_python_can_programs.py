@@ -15,7 +15,7 @@ from pathlib import Path
 import can
 import pytest
 
-from can_dbc.hub import HubBus
+from ato_hil.can_dbc.hub import HubBus
 
 TIMEOUT_S = 30.0
 

@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc import private_vcan_server, socketcan
-from can_dbc.bus import FOREIGN
-from can_dbc.socketcan import SocketBus, enlarge_receive_buffer
+from ato_hil.can_dbc import private_vcan_server, socketcan
+from ato_hil.can_dbc.bus import FOREIGN
+from ato_hil.can_dbc.socketcan import SocketBus, enlarge_receive_buffer
 
 TIMEOUT_S = 10.0
 FRAMES = st.lists(st.tuples(st.integers(0, 0x7FF), st.integers(-(2**63), 2**63 - 1)), max_size=20)

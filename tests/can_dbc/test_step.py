@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numba.core.errors import NumbaError
 
-from can_dbc import step as step_module
-from can_dbc.step import Checked, step
+from ato_hil.can_dbc import step as step_module
+from ato_hil.can_dbc.step import Checked, step
 
 LOW, HIGH = -(2**63), 2**63 - 1
 EDGES = st.sampled_from([LOW, LOW + 1, -(2**32), -1, 0, 1, 2**31, 2**32, HIGH - 1, HIGH])
@@ -148,8 +149,8 @@ SAME = """
 import json, random
 import numpy as np
 from can_dbc import e2e
-from can_dbc.codec import MESSAGES, Signal, get, put, saturate
-from can_dbc.step import INTERPRETED, int64
+from ato_hil.can_dbc.codec import MESSAGES, Signal, get, put, saturate
+from ato_hil.can_dbc.step import INTERPRETED, int64
 
 random.seed(1)
 out = []
@@ -197,7 +198,7 @@ def test_interpreted_codec_and_protection_give_the_bits_of_the_compiled_ones() -
 
 def test_an_interpreted_step_is_the_function_itself() -> None:
     code = (
-        "from can_dbc.step import Checked, int64, step\n"
+        "from ato_hil.can_dbc.step import Checked, int64, step\n"
         "def function(): pass\n"
         "print(step(function) is function, int64 is Checked)\n"
     )
@@ -229,7 +230,7 @@ def test_a_step_that_would_allocate_is_refused(function: Any, argument: Any) -> 
 CACHED = """
 import json
 from can_dbc import e2e
-from can_dbc.codec import FORCE_CMD, get, put, saturate
+from ato_hil.can_dbc.codec import FORCE_CMD, get, put, saturate
 
 calls = [
     (get, (1 << 40, FORCE_CMD.Force)),
@@ -257,8 +258,8 @@ def test_a_second_process_compiles_nothing(tmp_path: Path) -> None:
 
 CLOSURES = """
 import sys
-from can_dbc.codec import FORCE_CMD, get
-from can_dbc.step import step
+from ato_hil.can_dbc.codec import FORCE_CMD, get
+from ato_hil.can_dbc.step import step
 
 
 @step
@@ -315,11 +316,25 @@ def test_the_cache_is_in_the_folder_of_the_user(
 def test_a_package_is_keyed_by_what_it_may_import_only() -> None:
     digests = {step_module.source_digest(package) for package in step_module.IMPORTS}
     assert len(digests) == 4
-    assert step_module.source_digest("elsewhere") == step_module.source_digest("tools")
+
+
+@pytest.mark.parametrize(
+    ("module", "package"),
+    [
+        ("ato_hil.controller.laws.cailc", "controller"),
+        ("ato_hil.can_dbc.e2e", "can_dbc"),
+        ("ato_hil", "tools"),
+        ("ato_hil.law", "tools"),
+        ("own_law.controller", "tools"),
+        ("controller", "tools"),
+    ],
+)
+def test_a_step_from_elsewhere_is_keyed_by_all_packages(module: str, package: str) -> None:
+    assert step_module.package_of(SimpleNamespace(__module__=module)) == package
 
 
 def test_the_cache_depends_on_the_dbc(tmp_path: Path) -> None:
-    code = "from can_dbc.step import source_digest; print(source_digest())"
+    code = "from ato_hil.can_dbc.step import source_digest; print(source_digest())"
     changed = tmp_path / "changed.dbc"
     changed.write_text(step_module.dbc_path().read_text() + "\n")
     assert python(code) == python(code)

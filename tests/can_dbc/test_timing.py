@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from can_dbc.timing import Stream, frame_bits, response_time
+from ato_hil.can_dbc.timing import Stream, frame_bits, response_time
 
 HORIZON = 600
 

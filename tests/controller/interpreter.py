@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc.step import INTERPRETED, int64
-from controller.firmware import build_tick
-from controller.registry import law_step, load_law
+from ato_hil.can_dbc.step import INTERPRETED, int64
+from ato_hil.controller.firmware import build_tick
+from ato_hil.controller.registry import law_step, load_law
 
 
 def argument(value: Any) -> Any:

@@ -6,15 +6,31 @@ import math
 import numpy as np
 import pytest
 
-from can_dbc import e2e
-from controller import calibration, distribution, reference
-from controller.calibration import GuardSettings, Line, MemorySettings, PlausibleSettings
-from controller.memory import initial_memory
-from controller.neighbours import NeighbourSettings
-from controller.quantise import CalibrationError, Vehicle, fixed
-from controller.rebasing import RebasingSettings
-from controller.reference import CURSOR, REFERENCE_PARAMS, SEGMENT, advance, rewind
-from controller.registry import LawError, law_names, law_number, load_law
+from ato_hil.can_dbc import e2e
+from ato_hil.controller import calibration, distribution, reference
+from ato_hil.controller.calibration import (
+    GuardSettings,
+    Line,
+    MemorySettings,
+    PlausibleSettings,
+)
+from ato_hil.controller.memory import initial_memory
+from ato_hil.controller.neighbours import NeighbourSettings
+from ato_hil.controller.quantise import CalibrationError, Vehicle, fixed
+from ato_hil.controller.rebasing import RebasingSettings
+from ato_hil.controller.reference import (
+    CURSOR,
+    REFERENCE_PARAMS,
+    SEGMENT,
+    advance,
+    rewind,
+)
+from ato_hil.controller.registry import (
+    LawError,
+    law_names,
+    law_number,
+    load_law,
+)
 
 CAILC = {
     "alpha": 8.0,

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller import characteristic
-from controller.q import INT32_MAX
-from controller.quantise import CalibrationError, Characteristic, Vehicle
+from ato_hil.controller import characteristic
+from ato_hil.controller.q import INT32_MAX
+from ato_hil.controller.quantise import CalibrationError, Characteristic, Vehicle
 
 CRH3 = Characteristic(force_n=300e3, slope_n_s_m=1022.4, power_w=8844500.0)
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc.step import step
-from controller import distribution
-from controller.distribution import CARS_MAX, calibrate, distribute
-from controller.quantise import CalibrationError
+from ato_hil.can_dbc.step import step
+from ato_hil.controller import distribution
+from ato_hil.controller.distribution import CARS_MAX, calibrate, distribute
+from ato_hil.controller.quantise import CalibrationError
 
 # The subway train of paper 1: Upsilon, motor cars.
 MU = [1.0, 0.5, 0.4, 0.6, 1.0, 0.5]
@@ -152,7 +152,7 @@ def test_no_car_gives_less_when_more_is_asked(train, u):
 def test_no_force_overflows(interpreted, train, u):
     params = calibrate(*train)
     checked = np.zeros(CARS_MAX, np.int32)
-    interpreted("controller.distribution:distribute", params, u, checked)
+    interpreted("ato_hil.controller.distribution:distribute", params, u, checked)
     assert (checked == forces(params, u)).all()
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from can_dbc.step import step
-from controller import gradient_map
-from controller.quantise import CalibrationError
+from ato_hil.can_dbc.step import step
+from ato_hil.controller import gradient_map
+from ato_hil.controller.quantise import CalibrationError
 
 HILLS = (
     (100.0, 0.02, 0.0),
@@ -67,9 +67,15 @@ def test_a_wild_position_does_not_overflow(interpreted):
     params["slope"] = 2**31 - 1
     for section in range(6):
         for position in (-(2**31), 2**31 - 1, 0):
-            value = interpreted("controller.gradient_map:acceleration", params, section, position)
+            value = interpreted(
+                "ato_hil.controller.gradient_map:acceleration", params, section, position
+            )
             assert -(2**31) <= value < 2**31
-            assert 0 <= interpreted("controller.gradient_map:read", params, section, position) <= 5
+            assert (
+                0
+                <= interpreted("ato_hil.controller.gradient_map:read", params, section, position)
+                <= 5
+            )
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller import guard
-from controller.interface import (
+from ato_hil.controller import guard
+from ato_hil.controller.interface import (
     FAULT_ATP,
     FAULT_BARRIER,
     FAULT_CONTROL_LOST,
@@ -40,7 +40,7 @@ from controller.interface import (
     GUARD_NORMAL,
     GUARD_SERVICE_BRAKE,
 )
-from tools.verify.mutants import interpreted, is_caught, mutants
+from tests.mutants import interpreted, is_caught, mutants
 
 INT32_MAX, INT32_MIN = 2**31 - 1, -(2**31)
 V, A = 1 << 24, 1 << 27  # 1 m/s, 1 m/s^2

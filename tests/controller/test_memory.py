@@ -10,9 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc.step import int64, step
-from controller import memory
-from controller.memory import CELL, MEMORY_PARAMS, MEMORY_STATE, WORDS_MAX
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller import memory
+from ato_hil.controller.memory import (
+    CELL,
+    MEMORY_PARAMS,
+    MEMORY_STATE,
+    WORDS_MAX,
+)
 
 INT32 = st.integers(-(2**31), 2**31 - 1)
 
@@ -279,11 +284,15 @@ def test_no_value_overflows(interpreted, values, learned, grid):
     cells = [np.zeros(1, CELL), np.zeros(1, CELL)]
     for increment in learned:
         memory.gather(params[0], mine.state[0], mine.stored, cells[0][0], 0)
-        interpreted("controller.memory:gather", params, checked.state, checked.stored, cells[1], 0)
+        interpreted(
+            "ato_hil.controller.memory:gather", params, checked.state, checked.stored, cells[1], 0
+        )
         for cell in cells:
             cell["learn"][0, 0] = increment
         memory.scatter(params[0], mine.state[0], mine.stored, cells[0][0])
-        interpreted("controller.memory:scatter", params, checked.state, checked.stored, cells[1])
+        interpreted(
+            "ato_hil.controller.memory:scatter", params, checked.state, checked.stored, cells[1]
+        )
     assert cells[0] == cells[1]
     assert (mine.stored == checked.stored).all()
     assert mine.state == checked.state
@@ -385,10 +394,12 @@ def test_no_recalled_value_overflows(interpreted):
         each.stored[:] = -(2**31)
     cells = [np.zeros(1, CELL), np.zeros(1, CELL)]
     memory.rewind(params[0], mine.state[0], mine.stored, cells[0][0])
-    interpreted("controller.memory:rewind", params, checked.state, checked.stored, cells[1])
+    interpreted("ato_hil.controller.memory:rewind", params, checked.state, checked.stored, cells[1])
     for _ in range(3):
         memory.gather(params[0], mine.state[0], mine.stored, cells[0][0], 0)
-        interpreted("controller.memory:gather", params, checked.state, checked.stored, cells[1], 0)
+        interpreted(
+            "ato_hil.controller.memory:gather", params, checked.state, checked.stored, cells[1], 0
+        )
     assert cells[0] == cells[1]
     assert abs(int(cells[0]["smooth"][0]) + 2**31) <= 2 * memory.SMOOTH_MAX + 2
 
@@ -504,11 +515,11 @@ def test_no_value_along_the_track_overflows(interpreted, values, ticks, pitch):
     for place, learn in ticks:
         memory.gather(params[0], mine.state[0], mine.stored, cells[0][0], place)
         arguments = (params, checked.state, checked.stored, cells[1])
-        interpreted("controller.memory:gather", *arguments, place)
+        interpreted("ato_hil.controller.memory:gather", *arguments, place)
         for cell in cells:
             cell["learn"][0, 0] = learn
         memory.scatter(params[0], mine.state[0], mine.stored, cells[0][0])
-        interpreted("controller.memory:scatter", *arguments)
+        interpreted("ato_hil.controller.memory:scatter", *arguments)
     assert cells[0] == cells[1]
     assert (mine.stored == checked.stored).all()
     assert mine.state == checked.state

@@ -5,18 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.codec import (
+from ato_hil.can_dbc.codec import (
     NEIGHBOUR_AHEAD_MOTION,
     NEIGHBOUR_AHEAD_POSITION,
     NEIGHBOUR_BEHIND_MOTION,
     NEIGHBOUR_BEHIND_POSITION,
     put,
 )
-from can_dbc.step import step
-from controller import neighbours
-from controller.interface import AHEAD, BEHIND, INPUTS
-from controller.neighbours import HISTORY, NeighbourSettings
-from controller.quantise import CalibrationError
+from ato_hil.can_dbc.step import step
+from ato_hil.controller import neighbours
+from ato_hil.controller.interface import AHEAD, BEHIND, INPUTS
+from ato_hil.controller.neighbours import HISTORY, NeighbourSettings
+from ato_hil.controller.quantise import CalibrationError
 
 PERIOD_S = 0.01
 AGE_MAX = 150
@@ -250,7 +250,7 @@ def test_whatever_the_state_holds_stays_inside_the_integers(interpreted, records
     def holds(state, inputs):
         checked = [state.copy(), inputs.copy()]
         params = calibrated()
-        lost = interpreted("controller.neighbours:project", params, *checked)
+        lost = interpreted("ato_hil.controller.neighbours:project", params, *checked)
         assert project(params, state, inputs) == lost
         assert (state.tobytes(), inputs.tobytes()) == tuple(one.tobytes() for one in checked)
 

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from controller import plausibility
-from controller.interface import (
+from ato_hil.controller import plausibility
+from ato_hil.controller.interface import (
     FAULT_POSITION_IMPLAUSIBLE,
     FAULT_PROGRESS,
     FAULT_SPEED_IMPLAUSIBLE,
 )
-from tools.verify.mutants import interpreted, is_caught, mutants
+from tests.mutants import interpreted, is_caught, mutants
 
 V, X = 1 << 24, 1 << 15  # 1 m/s, 1 m
 PERIOD = 1 << 23  # 1/128 s: exact

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc import e2e, pace
-from can_dbc.codec import (
+from ato_hil.can_dbc import e2e, pace
+from ato_hil.can_dbc.codec import (
     ATO_STATUS,
     ATP_LIMIT,
     FORCE_CMD,
@@ -17,8 +17,8 @@ from can_dbc.codec import (
     get,
     put,
 )
-from controller import node, process
-from controller.interface import (
+from ato_hil.controller import node, process
+from ato_hil.controller.interface import (
     ARMED,
     ENDED,
     FAULT_SPEED_LOST,
@@ -26,8 +26,8 @@ from controller.interface import (
     FAULTS_THAT_BLOCK_LEARNING,
     RUNNING,
 )
-from plant_sim.scenario import load
-from tools.setup import calibration_for
+from ato_hil.plant_sim.scenario import load
+from ato_hil.tools.runs.onboard import calibration_for
 
 PERIOD_NS = 10_000_000
 LATE_NS = PERIOD_NS // 2

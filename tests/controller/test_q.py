@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba import njit
 
-from controller import q
+from ato_hil.controller import q
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 ONE = 1 << 30
@@ -73,11 +73,11 @@ def test_exp2_minus_never_rises():
 
 @given(st.integers(0, ONE))
 def test_the_interpreter_agrees(interpreted, s):
-    assert interpreted("controller.q:sin_half_pi", s) == q.sin_half_pi(s)
-    assert interpreted("controller.q:divide_round", s, 0) == 0
-    assert interpreted("controller.q:divide_round", -s, 7) == q.divide_round(-s, 7)
-    assert interpreted("controller.q:round_shift", -s, 3) == q.round_shift(-s, 3)
-    assert interpreted("controller.q:exp2_minus", s) == q.exp2_minus(s)
+    assert interpreted("ato_hil.controller.q:sin_half_pi", s) == q.sin_half_pi(s)
+    assert interpreted("ato_hil.controller.q:divide_round", s, 0) == 0
+    assert interpreted("ato_hil.controller.q:divide_round", -s, 7) == q.divide_round(-s, 7)
+    assert interpreted("ato_hil.controller.q:round_shift", -s, 3) == q.round_shift(-s, 3)
+    assert interpreted("ato_hil.controller.q:exp2_minus", s) == q.exp2_minus(s)
 
 
 @njit

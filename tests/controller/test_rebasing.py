@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from can_dbc.step import step
-from controller import neighbours, rebasing
-from controller.interface import AHEAD, BEHIND, INPUTS
-from controller.quantise import CalibrationError
-from controller.rebasing import OFFSET_MAX, OFFSET_SPEED_MAX, RebasingSettings
+from ato_hil.can_dbc.step import step
+from ato_hil.controller import neighbours, rebasing
+from ato_hil.controller.interface import AHEAD, BEHIND, INPUTS
+from ato_hil.controller.quantise import CalibrationError
+from ato_hil.controller.rebasing import OFFSET_MAX, OFFSET_SPEED_MAX, RebasingSettings
 
 PERIOD_S = 0.01
 S0 = 510.0
@@ -353,7 +353,7 @@ def test_whatever_the_state_holds_stays_inside_the_integers(interpreted, records
         params = calibrated()
         checked = [state.copy(), inputs.copy()]
         sides = around["side"][0].copy()
-        interpreted("controller.rebasing:follow", params, checked[0], sides, checked[1])
+        interpreted("ato_hil.controller.rebasing:follow", params, checked[0], sides, checked[1])
         follow(params, state, around, inputs)
         assert (state.tobytes(), inputs.tobytes()) == tuple(one.tobytes() for one in checked)
         for name, (low, high) in bounds.items():

@@ -8,11 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.step import step
-from controller import reference
-from controller.reference import CURSOR, REFERENCE_PARAMS, SEGMENT
-from plant_sim.profile import evaluate, rate_of, stretched, stretched_ticks, unit_factors
-from plant_sim.scenario import load, scenario_names
+from ato_hil.can_dbc.step import step
+from ato_hil.controller import reference
+from ato_hil.controller.reference import CURSOR, REFERENCE_PARAMS, SEGMENT
+from ato_hil.plant_sim.profile import (
+    evaluate,
+    rate_of,
+    stretched,
+    stretched_ticks,
+    unit_factors,
+)
+from ato_hil.plant_sim.scenario import load, scenario_names
 
 
 @step
@@ -159,10 +165,10 @@ def test_inside_a_tick_nothing_overflows(interpreted, x, v, a, jerk, phase, rate
     profile = np.array([(1, jerk)], SEGMENT)
     for name in ("speed", "acceleration"):
         found = getattr(reference, name)(params[0], cursor[0])
-        assert interpreted(f"controller.reference:{name}", params, cursor) == found
+        assert interpreted(f"ato_hil.controller.reference:{name}", params, cursor) == found
     found = reference.position(cursor[0])
-    assert interpreted("controller.reference:position", cursor) == found
-    interpreted("controller.reference:advance", params, cursor, profile)
+    assert interpreted("ato_hil.controller.reference:position", cursor) == found
+    interpreted("ato_hil.controller.reference:advance", params, cursor, profile)
 
 
 def test_the_length_of_a_table_is_where_it_ends():

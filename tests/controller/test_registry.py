@@ -4,7 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from controller.registry import LawError, is_file, law_label, law_names, law_step, load_law
+from ato_hil.controller.registry import (
+    LawError,
+    is_file,
+    law_label,
+    law_names,
+    law_step,
+    load_law,
+)
 
 LAW = """
 import msgspec

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller import separation
-from controller.interface import INPUTS
-from controller.quantise import CalibrationError
+from ato_hil.controller import separation
+from ato_hil.controller.interface import INPUTS
+from ato_hil.controller.quantise import CalibrationError
 
 L1, L2, D = 400.0, 600.0, 1e7
 MOST = 1.0
@@ -91,7 +91,7 @@ def test_every_distance_stays_inside_the_integers(interpreted):
     thinnest = separation.calibrate(l1_m=400.0, l2_m=400.5, d=0.0, most_m_s2=15.9)
     for numbers in (params(), widest, thinnest):
         for raw in (-(2**31), 2**31 - 1, 0, 1, -1, 400 << 15, 600 << 15, 2**30, 2890 << 15):
-            found = interpreted("controller.separation:push", numbers, raw)
+            found = interpreted("ato_hil.controller.separation:push", numbers, raw)
             assert found == separation.push(numbers[0], raw)
             assert abs(found) <= int(numbers["most"][0])
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller import store
-from controller.calibration import Calibration
-from controller.memory import MEMORY_PARAMS
+from ato_hil.controller import store
+from ato_hil.controller.calibration import Calibration
+from ato_hil.controller.memory import MEMORY_PARAMS
 
 CELLS, WORDS = 4, 3
 DIGEST = "0123456789abcdef" * 2

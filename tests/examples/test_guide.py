@@ -25,7 +25,7 @@ BLOCKS = [
 def on_this_machine(line: str) -> str:
     """The shell command with the programs of this environment."""
     python = shlex.quote(sys.executable)
-    line = re.sub(r"^ato-hil", f"{python} -m tools.cli", line)
+    line = re.sub(r"^ato-hil", f"{python} -m ato_hil", line)
     return re.sub(r"^python examples/", f"{python} {shlex.quote(str(ROOT / 'examples'))}/", line)
 
 

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc import e2e
-from can_dbc.codec import MESSAGES, database, word_of
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import MESSAGES, database, word_of
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 NAMES = [message.name for message in MESSAGES if message.name != "ATO_ESTIMATE"]

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from can_dbc.bus import open_bus, recv_frames
-from can_dbc.codec import FORCE_CMD, TRAIN_POSITION, get
+from ato_hil.can_dbc.bus import open_bus, recv_frames
+from ato_hil.can_dbc.codec import FORCE_CMD, TRAIN_POSITION, get
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 MASS_KG = "194295"
@@ -38,7 +38,7 @@ FAULTY = """
 import sys
 sys.path.insert(0, {examples!r})
 import controller, link
-from can_dbc.hub import HubBus
+from ato_hil.can_dbc.hub import HubBus
 send = HubBus.send
 def spoil(bus, message, timeout=None):
     if {everything} or message.arbitration_id == {force_cmd}:
@@ -90,7 +90,7 @@ class Session:
 
     @staticmethod
     def command(*arguments: str) -> list[str]:
-        return [sys.executable, "-m", "tools.cli", *arguments]
+        return [sys.executable, "-m", "ato_hil", *arguments]
 
     @property
     def output(self) -> str:

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plant_sim import actuator
-from plant_sim.actuator import CHANNELS_MAX, DELAY_MAX, Actuator
+from ato_hil.plant_sim import actuator
+from ato_hil.plant_sim.actuator import CHANNELS_MAX, DELAY_MAX, Actuator
 
 MASS = 194295.0
 PERIOD = 0.01

@@ -9,11 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc import e2e
-from can_dbc.codec import FORCE_CMD, put, saturate
-from plant_sim import atp, plant, track, world
-from plant_sim.brakes import Brake, Step
-from plant_sim.scenario import ScenarioError, load, overlaid
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import FORCE_CMD, put, saturate
+from ato_hil.plant_sim import (
+    atp,
+    plant,
+    track,
+    world,
+)
+from ato_hil.plant_sim.brakes import Brake, Step
+from ato_hil.plant_sim.scenario import ScenarioError, load, overlaid
 
 KM_H = 1 / 3.6
 LEVEL = track.sections(track.Track())

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plant_sim import actuator, brakes, world
+from ato_hil.plant_sim import actuator, brakes, world
 
 PERIOD_S = 0.01
 SERVICE = brakes.Brake(steps=[brakes.Step(deceleration_m_s2=0.8)], build_up_s=0.04)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from can_dbc.faults import FaultError, Planned
-from plant_sim import failures, plant
+from ato_hil.can_dbc.faults import FaultError, Planned
+from ato_hil.plant_sim import failures, plant
 
 PERIOD_S = 0.01
 

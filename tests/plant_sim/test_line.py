@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from can_dbc.codec import ATP_LIMIT, get
-from plant_sim import atp, plant, world
-from plant_sim.profile import POSITION_UNIT_M
-from plant_sim.scenario import ScenarioError, load, members
+from ato_hil.can_dbc.codec import ATP_LIMIT, get
+from ato_hil.plant_sim import atp, plant, world
+from ato_hil.plant_sim.profile import POSITION_UNIT_M
+from ato_hil.plant_sim.scenario import ScenarioError, load, members
 
 SPACING_M = 509.9019513592785
 

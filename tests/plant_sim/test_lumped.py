@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plant_sim import actuator, plant
-from plant_sim.actuator import Actuator
-from plant_sim.scenario import load
-from plant_sim.track import Track, sections
-from plant_sim.trains import lumped
+from ato_hil.plant_sim import actuator, plant
+from ato_hil.plant_sim.actuator import Actuator
+from ato_hil.plant_sim.scenario import load
+from ato_hil.plant_sim.track import Track, sections
+from ato_hil.plant_sim.trains import lumped
 
 PERIOD = 0.01
 TRAIN = load("subway-paper").scenario.train

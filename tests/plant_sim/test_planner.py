@@ -9,8 +9,15 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from plant_sim.planner import PlanError, ProfilePlan, Ramp, SpeedLimit, limit_at, plan_profile
-from plant_sim.profile import evaluate, unit_factors
+from ato_hil.plant_sim.planner import (
+    PlanError,
+    ProfilePlan,
+    Ramp,
+    SpeedLimit,
+    limit_at,
+    plan_profile,
+)
+from ato_hil.plant_sim.profile import evaluate, unit_factors
 
 SUBWAY = """
 duration_s = 190.0

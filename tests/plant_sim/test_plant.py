@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc import e2e
-from can_dbc.codec import (
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import (
     ATO_STATUS,
     ATP_LIMIT,
     CAR_FORCE_1,
@@ -25,8 +25,8 @@ from can_dbc.codec import (
     get,
     put,
 )
-from plant_sim import atp, plant, world
-from plant_sim.scenario import load
+from ato_hil.plant_sim import atp, plant, world
+from ato_hil.plant_sim.scenario import load
 
 PAPER, DEFAULT = "subway-paper", "subway"
 
@@ -412,7 +412,7 @@ def test_an_announcement_is_confirmed_only_by_its_own_state_and_run(run_state):
 DRIVE = """
 import numpy as np
 from plant_sim import plant, world
-from plant_sim.scenario import load
+from ato_hil.plant_sim.scenario import load
 
 for name in ("subway-paper", "subway", "subway-atp:short"):
     loaded = load(name)

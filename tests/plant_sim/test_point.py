@@ -9,10 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from can_dbc.step import step
-from plant_sim import actuator, plant, scenario
-from plant_sim.track import Track, resistance_at, section_at, sections
-from plant_sim.trains import point
+from ato_hil.can_dbc.step import step
+from ato_hil.plant_sim import actuator, plant, scenario
+from ato_hil.plant_sim.track import (
+    Track,
+    resistance_at,
+    section_at,
+    sections,
+)
+from ato_hil.plant_sim.trains import point
 
 MASS_KG = 510e3
 PERIOD_S = 0.01

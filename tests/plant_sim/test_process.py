@@ -7,10 +7,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from can_dbc import e2e, pace
-from can_dbc.codec import FORCE_CMD, RUN_CTRL, TRAIN_POSITION, get, put
-from plant_sim import plant, process, world
-from plant_sim.scenario import load
+from ato_hil.can_dbc import e2e, pace
+from ato_hil.can_dbc.codec import (
+    FORCE_CMD,
+    RUN_CTRL,
+    TRAIN_POSITION,
+    get,
+    put,
+)
+from ato_hil.plant_sim import plant, process, world
+from ato_hil.plant_sim.scenario import load
 
 PERIOD_NS = 10_000_000
 TICKS = 30

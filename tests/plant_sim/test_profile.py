@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plant_sim.profile import SEGMENT, evaluate, unit_factors
+from ato_hil.plant_sim.profile import SEGMENT, evaluate, unit_factors
 
 PERIODS_S = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0]
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc import e2e
-from can_dbc.codec import (
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import (
     ATO_RADIO,
     MESSAGES,
     NEIGHBOUR_AHEAD_MOTION,
@@ -21,8 +21,8 @@ from can_dbc.codec import (
     get,
     put,
 )
-from plant_sim import plant, radio, world
-from plant_sim.scenario import load, members
+from ato_hil.plant_sim import plant, radio, world
+from ato_hil.plant_sim.scenario import load, members
 
 TRAINS = 3
 PLACE = (NEIGHBOUR_AHEAD_POSITION, NEIGHBOUR_BEHIND_POSITION)

@@ -5,7 +5,7 @@ import tomllib
 
 import pytest
 
-from plant_sim.scenario import (
+from ato_hil.plant_sim.scenario import (
     FOLDER,
     ScenarioError,
     case_names,
@@ -14,7 +14,7 @@ from plant_sim.scenario import (
     overlaid,
     scenario_names,
 )
-from plant_sim.trains import couplers, lumped
+from ato_hil.plant_sim.trains import couplers, lumped
 
 
 @pytest.fixture

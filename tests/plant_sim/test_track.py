@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plant_sim.track import Track, section_at, sections
+from ato_hil.plant_sim.track import Track, section_at, sections
 
 HILLS = Track(from_m=[150.0, 250.0, 600.0, 3300.0], resistance_n_per_kn=[-2.0, 1.85, 2.81, 0.0])
 

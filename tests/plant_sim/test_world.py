@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plant_sim import actuator, world
-from plant_sim.scenario import at_rate, load
+from ato_hil.plant_sim import actuator, world
+from ato_hil.plant_sim.scenario import at_rate, load
 
 NOISE = "[sensors]\nspeed_noise_m_s = 0.005\n"
 LOAD = "[disturbance]\namplitude_m_s2 = 0.01\n"

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tools import session
+from ato_hil.tools.session import session
 
 SHORT = """
 base = "subway-fast"
@@ -56,7 +56,7 @@ def ato_hil() -> Callable[..., subprocess.CompletedProcess[str]]:
 
     def run(*arguments: str, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [sys.executable, "-m", "tools.cli", *arguments],
+            [sys.executable, "-m", "ato_hil", *arguments],
             cwd=cwd,
             env={**os.environ, **environment},
             capture_output=True,

@@ -7,7 +7,7 @@ from pathlib import Path
 import can
 import pytest
 
-from can_dbc.bus import open_bus, private_vcan_reason, socketcan_reason
+from ato_hil.can_dbc.bus import open_bus, private_vcan_reason, socketcan_reason
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from can_dbc.step import IMPORTS, cache_directory
+from ato_hil.can_dbc.step import IMPORTS, cache_directory
 
 pytestmark = pytest.mark.uml
 
@@ -21,7 +21,7 @@ SCENARIO = Path(__file__).with_name("short.toml")
 def run(folder: Path, *arguments: str, before: tuple[str, ...] = (), **environment: str) -> dict:
     """The summary of a session that ended well."""
     done = subprocess.run(
-        [*before, sys.executable, "-m", "tools.cli", "run", str(SCENARIO), *arguments],
+        [*before, sys.executable, "-m", "ato_hil", "run", str(SCENARIO), *arguments],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), **environment},
         capture_output=True,

@@ -12,8 +12,8 @@ from pathlib import Path
 import can
 import pytest
 
-from can_dbc import private_vcan_server as server
-from can_dbc.bus import (
+from ato_hil.can_dbc import private_vcan_server as server
+from ato_hil.can_dbc.bus import (
     FOREIGN,
     BusError,
     choose_bus,
@@ -217,7 +217,7 @@ def test_auto_takes_vcan0():
 
 
 def test_auto_takes_a_private_vcan_where_there_is_no_other(monkeypatch):
-    monkeypatch.setattr("can_dbc.bus.DEFAULT_CHANNEL", "vcan9")
+    monkeypatch.setattr("ato_hil.can_dbc.bus.DEFAULT_CHANNEL", "vcan9")
     choice = choose_bus("auto")
     assert choice.name == "vcan:vcan9"
     assert "there is no network interface 'vcan9' for CAN" in choice.reason
@@ -262,7 +262,7 @@ def test_the_bus_outlives_its_server(node, runtime_dir):
 def test_nodes_that_start_at_once_meet(runtime_dir):
     code = (
         "import sys\n"
-        "from can_dbc.bus import open_bus, recv_frames, send_frames\n"
+        "from ato_hil.can_dbc.bus import open_bus, recv_frames, send_frames\n"
         "with open_bus('vcan') as bus:\n"
         "    print(bus.server_pid, flush=True)\n"
         "    sys.stdin.readline()\n"

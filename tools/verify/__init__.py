@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from dataclasses import dataclass
 from typing import TypeVar
 
 import msgspec
+
+from ato_hil.can_dbc.child import python
+from ato_hil.can_dbc.errors import InputError
 
 PASSED, FAILED, ABSENT = "passed", "failed", "absent"
 
@@ -21,7 +23,7 @@ Report = TypeVar("Report")
 PROCESS_TIMEOUT_S = 1800.0
 
 
-class VerifyError(ValueError):
+class VerifyError(InputError):
     """The verification cannot begin; one line."""
 
 
@@ -47,7 +49,7 @@ def asked(
     """What `python -m MODULE ARGUMENTS` prints last: a JSON object of the struct `kind`, whose
     `error` names the reason if the process fails."""
     process = subprocess.run(
-        [sys.executable, "-m", module, *arguments],
+        python("-m", module, *arguments),
         env={**os.environ, **environment},
         capture_output=True,
         text=True,

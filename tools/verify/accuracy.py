@@ -16,17 +16,24 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from can_dbc.codec import mailboxes
-from can_dbc.step import step
-from controller import firmware, memory, node
-from controller.interface import FAULTS_THAT_BLOCK_LEARNING
-from controller.registry import is_file, law_step, load_law
-from plant_sim import world
-from plant_sim.scenario import Loaded, load, members
-from tools import setup, sil
-from tools.verify import ABSENT, FAILED, Row, identity, row
-from tools.verify.reference import Reference
-from tools.verify.references import REFERENCES
+from ato_hil.can_dbc.codec import mailboxes
+from ato_hil.can_dbc.step import step
+from ato_hil.controller import firmware, memory, node
+from ato_hil.controller.interface import FAULTS_THAT_BLOCK_LEARNING
+from ato_hil.controller.registry import is_file, law_step, load_law
+from ato_hil.plant_sim import world
+from ato_hil.plant_sim.scenario import Loaded, load, members
+from ato_hil.tools.papers.reference import Reference
+from ato_hil.tools.papers.references import REFERENCES
+from ato_hil.tools.runs import onboard
+from ato_hil.tools.session import sil
+from ato_hil.tools.verify import (
+    ABSENT,
+    FAILED,
+    Row,
+    identity,
+    row,
+)
 
 RUNS = 3
 
@@ -100,7 +107,7 @@ def differences(law: str, reference: Reference, loaded: Loaded) -> tuple[float, 
     with sensors that only the DBC quantises: a coarser grid would blow a last bit up to a step."""
     module = load_law(law)
     loaded = ideal_sensors(loaded)
-    numbers = setup.run_numbers(law, RUNS)
+    numbers = onboard.run_numbers(law, RUNS)
     shadow, truths = _runs(module, reference, loaded, law, numbers, drive=0)
     _follows, reals = _runs(module, reference, loaded, law, numbers, drive=1)
     truth, real = np.concatenate(truths, axis=1), np.concatenate(reals, axis=1)
@@ -124,7 +131,7 @@ def ideal_sensors(loaded: Loaded) -> Loaded:
 
 def reference_runs(law: str, reference: Reference, loaded: Loaded, runs: int) -> list[np.ndarray]:
     """The truth of the first train in each run with the float64 law in the loop."""
-    numbers = setup.run_numbers(law, runs)
+    numbers = onboard.run_numbers(law, runs)
     truths = _runs(load_law(law), reference, loaded, law, numbers, drive=1)[1]
     return [truth[0] for truth in truths]
 
@@ -157,10 +164,10 @@ def _pair(
     module: ModuleType, reference: Reference, loaded: Loaded, law: str, drive: int, ticks: int
 ) -> node.Controller:
     """A controller with both forms of the law, for runs of at most so many ticks."""
-    calibration = setup.calibration_for(loaded, law)
+    calibration = onboard.calibration_for(loaded, law)
     scenario = loaded.scenario
     gains = msgspec.convert(scenario.laws[law], module.Gains, strict=False)
-    vehicle = setup.vehicle(scenario)
+    vehicle = onboard.vehicle(scenario)
     real = reference.params(gains, vehicle)
     params = np.zeros(1, firmware.params_dtype(params_dtype(module, real)))
     for part in params.dtype.names or ():

@@ -5,7 +5,7 @@ to the left with a test for overflow, and to test every store into 32 bits for i
 then run a few times slower than the firmware, and thousands of times faster than on interpreted
 `Checked` integers, which check the same and serve the searches and the short runs.
 
-Run as a process of its own (`python -m tools.verify.checked LAW SCENARIO...`), because what it
+Run as a process of its own (this module, LAW SCENARIO...), because what it
 tells the compiler holds for the process; its compiled code is kept apart. It prints one JSON
 object: WholeRuns.
 """
@@ -21,9 +21,9 @@ import msgspec
 from numba.core import lowering, types
 from numba.core.imputils import lower_builtin, lower_cast
 
-from can_dbc.step import cache_directory
-from tools.verify import asked, identity
-from tools.verify.overflow import where
+from ato_hil.can_dbc.step import cache_directory
+from ato_hil.tools.verify import asked, identity
+from ato_hil.tools.verify.overflow import where
 
 
 class WholeRuns(msgspec.Struct, frozen=True):
@@ -120,7 +120,7 @@ def ask(law: str, scenarios: list[str]) -> WholeRuns:
     """WholeRuns of a law in a process of its own."""
     cache = cache_directory() / "checked"
     environment = {"NUMBA_CACHE_DIR": str(cache)}
-    return asked(WholeRuns, "tools.verify.checked", [law, *scenarios], environment)
+    return asked(WholeRuns, "ato_hil.tools.verify.checked", [law, *scenarios], environment)
 
 
 def main(arguments: list[str]) -> None:

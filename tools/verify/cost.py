@@ -19,17 +19,37 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc import codec, e2e
-from can_dbc.codec import ATP_LIMIT, FORCE_CMD, TRAIN_POSITION, TRAIN_SPEED
-from can_dbc.step import int64, step
-from controller import distribution, firmware, guard, memory, node, q, reference
-from controller.interface import INPUTS, OUTPUTS, RUNNING
-from controller.memory import CELL
-from controller.registry import law_step, load_law
-from plant_sim.scenario import load
-from tools import setup
-from tools.verify import ABSENT, FAILED, Row, identity, overflow, row
-from tools.verify.instructions import C_FOLDER, ToolError
+from ato_hil.can_dbc import codec, e2e
+from ato_hil.can_dbc.codec import (
+    ATP_LIMIT,
+    FORCE_CMD,
+    TRAIN_POSITION,
+    TRAIN_SPEED,
+)
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller import (
+    distribution,
+    firmware,
+    guard,
+    memory,
+    node,
+    q,
+    reference,
+)
+from ato_hil.controller.interface import INPUTS, OUTPUTS, RUNNING
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.registry import law_step, load_law
+from ato_hil.plant_sim.scenario import load
+from ato_hil.tools.runs import onboard
+from ato_hil.tools.verify import (
+    ABSENT,
+    FAILED,
+    Row,
+    identity,
+    overflow,
+    row,
+)
+from ato_hil.tools.verify.instructions import C_FOLDER, ToolError
 
 ROWS = 2000  # a loop; its data stay in the cache
 ROUNDS = 200
@@ -281,7 +301,7 @@ def build_tick_loop(tick: Any) -> Any:
 def check_parts(law: str) -> Iterator[Row]:
     """Cost of each part of the tick and of the whole, with one law."""
     scenario = identity.scenario_of(law)
-    here = node.build(setup.calibration_for(load(scenario), law))
+    here = node.build(onboard.calibration_for(load(scenario), law))
     for message in (TRAIN_SPEED, TRAIN_POSITION, ATP_LIMIT):
         here.rx[message.index] = (e2e.protect(1 << 20, 0, message.data_id), 1, 0)
     params, profile, state, cells = here.params, here.profile, here.state, here.cells

@@ -12,15 +12,25 @@ from typing import Any
 
 import numpy as np
 
-from can_dbc import e2e
-from can_dbc.codec import RUN_CTRL, TRAIN_POSITION, TRAIN_SPEED, put
-from can_dbc.step import int64, step
-from controller import node
-from controller.interface import ARMED, RUNNING
-from controller.registry import load_law
-from plant_sim.scenario import load
-from tools import setup
-from tools.verify import ABSENT, Row, identity, row
+from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.codec import (
+    RUN_CTRL,
+    TRAIN_POSITION,
+    TRAIN_SPEED,
+    put,
+)
+from ato_hil.can_dbc.step import int64, step
+from ato_hil.controller import node
+from ato_hil.controller.interface import ARMED, RUNNING
+from ato_hil.controller.registry import load_law
+from ato_hil.plant_sim.scenario import load
+from ato_hil.tools.runs import onboard
+from ato_hil.tools.verify import (
+    ABSENT,
+    Row,
+    identity,
+    row,
+)
 
 TICKS = 100_000
 WARM_UP_TICKS = 2_000
@@ -33,7 +43,7 @@ STATM = Path("/proc/self/statm")
 def check(law: str) -> Iterator[Row]:
     """Rows of size and growth."""
     scenario = identity.scenario_of(law)
-    controller = node.build(setup.calibration_for(load(scenario), law))
+    controller = node.build(onboard.calibration_for(load(scenario), law))
     module = load_law(law)
     text = (
         f"law: params {module.PARAMS.itemsize}, state {module.STATE.itemsize};"

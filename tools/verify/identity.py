@@ -6,24 +6,36 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
-from can_dbc.bus import socketcan_reason
-from can_dbc.hub import DEFAULT_CHANNEL
-from controller.registry import is_file, load_law
-from plant_sim.scenario import Loaded, case_names, load, members, scenario_names
-from tools import line, setup, sil
-from tools.files import write_json
-from tools.frames import LineDigest
-from tools.verify import ABSENT, FAILED, Row, VerifyError, row
+from ato_hil.can_dbc.bus import socketcan_reason
+from ato_hil.can_dbc.child import python
+from ato_hil.can_dbc.hub import DEFAULT_CHANNEL
+from ato_hil.controller.registry import is_file, load_law
+from ato_hil.plant_sim.scenario import (
+    case_names,
+    load,
+    members,
+    scenario_names,
+    shortened,
+)
+from ato_hil.tools.runs import onboard, summary_row
+from ato_hil.tools.runs.files import write_json
+from ato_hil.tools.runs.frames import LineDigest
+from ato_hil.tools.session import sil
+from ato_hil.tools.verify import (
+    ABSENT,
+    FAILED,
+    Row,
+    VerifyError,
+    row,
+)
 
 GOLDEN = Path(__file__).with_name("golden.json")
 GOLDEN_RUNS = 3
@@ -49,19 +61,6 @@ class Variant:
     name: str
     arguments: tuple[str, ...]  # of `ato-hil run`
     environment: dict[str, str]
-
-
-def shortened(loaded: Loaded, ticks: int) -> Loaded:
-    """The scenario's first `ticks` control periods; 0 or more than it has: all."""
-    if not 0 < ticks < loaded.ticks:
-        return loaded
-    profile = loaded.profile
-    arrays = {
-        name: value[:ticks]
-        for name, value in vars(profile).items()
-        if isinstance(value, np.ndarray) and len(value) == loaded.ticks
-    }
-    return msgspec.structs.replace(loaded, profile=replace(profile, **arrays))
 
 
 def scenarios_of(law: str) -> list[str]:
@@ -102,10 +101,10 @@ def measured(scenario: str, law: str, runs: int, ticks: int = 0) -> Golden:
     trains = members(loaded)
     digest = LineDigest(len(trains))
     row: dict[str, Any] = {}
-    nodes = setup.controllers_for(trains, law)
-    for results in sil.run_line(loaded, nodes, runs=setup.run_numbers(law, runs), seed=SEED):
+    nodes = onboard.controllers_for(trains, law)
+    for results in sil.run_line(loaded, nodes, runs=onboard.run_numbers(law, runs), seed=SEED):
         digest.update([result.frames for result in results])
-        row = line.row_of(trains, law, results)
+        row = summary_row.row_of(trains, law, results)
     return Golden(digest.hex(), runs, {name: row.get(name) for name in GOLDEN_METRICS})
 
 
@@ -237,7 +236,7 @@ def check_processes(law: str) -> Iterator[Row]:
 
 def _check_variant(variant: Variant, scenario: str, law: str, expected: str, out: Path) -> Row:
     name, how = "same bits", f"{scenario}, {variant.name}"
-    command = [sys.executable, "-m", "tools.cli", "run", scenario, f"--law={law}", "--runs=1"]
+    command = python("-m", "ato_hil", "run", scenario, f"--law={law}", "--runs=1")
     command += [f"--seed={SEED}", f"--out={out}", *variant.arguments]
     process = subprocess.run(
         command,

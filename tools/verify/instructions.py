@@ -18,10 +18,17 @@ from types import ModuleType
 import llvmlite.binding as llvm
 import numpy as np
 
-from controller.interface import INPUTS, OUTPUTS
-from controller.memory import CELL
-from controller.registry import load_law
-from tools.verify import ABSENT, FAILED, Row, native, overflow, row
+from ato_hil.controller.interface import INPUTS, OUTPUTS
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.registry import load_law
+from ato_hil.tools.verify import (
+    ABSENT,
+    FAILED,
+    Row,
+    native,
+    overflow,
+    row,
+)
 
 C_FOLDER = Path(__file__).with_name("c")
 CASES = 200

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import llvmlite.binding as llvm
 
-from tools.verify.native import Native
+from ato_hil.tools.verify.native import Native
 
 # Written as LLVM writes types; a name in quotes may hold anything.
 FLOAT = re.compile(r"\b(half|bfloat|float|double|x86_fp80|fp128|ppc_fp128)\b")

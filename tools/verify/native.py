@@ -16,11 +16,11 @@ from numba.core import compiler, types
 from numba.core.errors import NumbaError
 from numba.core.registry import cpu_target
 
-from can_dbc.codec import MAILBOX
-from controller import firmware, reference
-from controller.interface import INPUTS, OUTPUTS
-from controller.memory import CELL
-from controller.registry import law_step
+from ato_hil.can_dbc.codec import MAILBOX
+from ato_hil.controller import firmware, reference
+from ato_hil.controller.interface import INPUTS, OUTPUTS
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.registry import law_step
 
 
 class RefusedError(ValueError):

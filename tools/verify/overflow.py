@@ -1,7 +1,7 @@
 """No overflow: the interpreted steps on checked integers, with the largest intermediate of every
 function kept.
 
-Run as a process of its own (`python -m tools.verify.overflow`), because steps are interpreted only
+Run as a process of its own (this module), because steps are interpreted only
 if ATO_HIL_INTERPRETED is set before they are imported. It prints one JSON object: a Report.
 """
 
@@ -17,13 +17,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from can_dbc.step import INTERPRETED
-from controller.interface import INPUTS, OUTPUTS
-from controller.memory import CELL
-from controller.registry import law_step, load_law
-from plant_sim.scenario import load
-from tools.setup import calibration_for
-from tools.verify import asked, identity
+from ato_hil.can_dbc.step import INTERPRETED
+from ato_hil.controller.interface import INPUTS, OUTPUTS
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.registry import law_step, load_law
+from ato_hil.plant_sim.scenario import load
+from ato_hil.tools.runs.onboard import calibration_for
+from ato_hil.tools.verify import asked, identity
 
 ROOT = Path(__file__).resolve().parents[2]
 LAWS = "controller/laws/"
@@ -51,10 +51,10 @@ class _Peaks:
         self.of: dict[Any, tuple[int, int]] = {}  # code object -> magnitude, line
 
     def install(self) -> None:
-        from can_dbc import step
+        from ato_hil.can_dbc import step
 
         low, high, make = -(2**63), 2**63 - 1, int.__new__
-        from controller import q
+        from ato_hil.controller import q
 
         helpers, peaks = {step.__file__, q.__file__}, self.of
 
@@ -97,7 +97,7 @@ class _Peaks:
 
 def place(file: str) -> str:
     """A source file as a reader knows it."""
-    path = Path(file)
+    path = Path(file).resolve()  # the package is links to the folders
     return path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else path.name
 
 
@@ -233,7 +233,7 @@ def calibrated(law: str) -> list[np.ndarray]:
 def ask(*arguments: str) -> Report:
     """A Report of this module in a process of its own, where the steps are interpreted."""
     environment = {"ATO_HIL_INTERPRETED": "1"}
-    return asked(Report, "tools.verify.overflow", list(arguments), environment)
+    return asked(Report, "ato_hil.tools.verify.overflow", list(arguments), environment)
 
 
 def main(arguments: list[str]) -> None:

@@ -19,24 +19,24 @@ from typing import Any
 
 import numpy as np
 
-from controller import registry
+from ato_hil.controller import registry
 
 SHARED_MODULES = (
-    "can_dbc.codec",
-    "can_dbc.e2e",
-    "controller.q",
-    "controller.interface",
-    "controller.memory",
-    "controller.reference",
-    "controller.plausibility",
-    "controller.guard",
-    "controller.gradient_map",
-    "controller.characteristic",
-    "controller.separation",
-    "controller.neighbours",
-    "controller.rebasing",
-    "controller.distribution",
-    "controller.firmware",
+    "ato_hil.can_dbc.codec",
+    "ato_hil.can_dbc.e2e",
+    "ato_hil.controller.q",
+    "ato_hil.controller.interface",
+    "ato_hil.controller.memory",
+    "ato_hil.controller.reference",
+    "ato_hil.controller.plausibility",
+    "ato_hil.controller.guard",
+    "ato_hil.controller.gradient_map",
+    "ato_hil.controller.characteristic",
+    "ato_hil.controller.separation",
+    "ato_hil.controller.neighbours",
+    "ato_hil.controller.rebasing",
+    "ato_hil.controller.distribution",
+    "ato_hil.controller.firmware",
 )
 
 RULES = {
@@ -62,7 +62,10 @@ C_KEYWORDS = set(
 )
 NUMPY_NAMES = {name for name in dir(np.recarray) + dir(np.record) if not name.startswith("_")}
 BUILTINS = {"min", "max", "abs", "range", "int64"}
-DIVIDES = ("controller.q", "divide_round")  # the one function whose division is defined for zero
+DIVIDES = (
+    "ato_hil.controller.q",
+    "divide_round",
+)  # the one function whose division is defined for zero
 SHIFT_MAX = 62
 
 
@@ -102,7 +105,7 @@ def linted_modules(laws: list[str]) -> list[ModuleType]:
     for module in found:  # grows as it goes
         for value in vars(module).values():
             owner = str(getattr(value, "__module__", ""))
-            if owner.startswith(("controller.laws.", "own_law.")) and owner not in {
+            if owner.startswith(("ato_hil.controller.laws.", "own_law.")) and owner not in {
                 m.__name__ for m in found
             }:
                 found.append(importlib.import_module(owner))
@@ -423,7 +426,7 @@ class _Checker:
                 return True  # what another law's step clamped
             case ast.Call():
                 target = _called(step, value)
-                if target == ("controller.q", "clamp"):
+                if target == ("ato_hil.controller.q", "clamp"):
                     return True
                 callee = self.steps.get(target) if target else None
                 if callee is None:
@@ -449,7 +452,7 @@ def unreached(laws: list[str]) -> list[str]:
     modules = linted_modules(laws)
     steps = {step.key: step for module in modules for step in steps_of(module)}
     graph = calls(steps)
-    ahead = [("controller.firmware", "tick")]
+    ahead = [("ato_hil.controller.firmware", "tick")]
     for law in laws:
         name = registry.load_law(law).__name__
         ahead.append((name, name.rsplit(".", 1)[-1]))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from can_dbc.step import INTERPRETED
-from controller.registry import law_names, load_law
-from tools.verify import (
+from ato_hil.can_dbc.step import INTERPRETED
+from ato_hil.controller.registry import law_names, load_law
+from ato_hil.tools.verify import (
     ABSENT,
     PASSED,
     Row,

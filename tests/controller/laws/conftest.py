@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from can_dbc.step import step
-from controller.interface import INPUTS, OUTPUTS
-from controller.memory import CELL
-from controller.quantise import Vehicle
+from ato_hil.can_dbc.step import step
+from ato_hil.controller.interface import INPUTS, OUTPUTS
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.quantise import Vehicle
 
 MASS_KG = 194295.0
 
@@ -32,7 +32,7 @@ def run_law() -> Callable[..., Any]:
     loops: dict[str, Any] = {}
 
     def loop_around(name: str) -> Any:
-        law = getattr(importlib.import_module(f"controller.laws.{name}"), name)
+        law = getattr(importlib.import_module(f"ato_hil.controller.laws.{name}"), name)
 
         @step
         def loop(params: Any, states: Any, cells: Any, inputs: Any, outputs: Any) -> None:
@@ -50,7 +50,7 @@ def run_law() -> Callable[..., Any]:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if name not in loops:
             loops[name] = loop_around(name)
-        module = importlib.import_module(f"controller.laws.{name}")
+        module = importlib.import_module(f"ato_hil.controller.laws.{name}")
         state = np.zeros(1, module.STATE) if state is None else state
         cells = np.zeros(len(inputs), CELL) if cells is None else cells
         outputs = np.zeros(len(inputs), OUTPUTS)
@@ -110,12 +110,12 @@ def check_every_input(interpreted: Any, records: Any, run_law: Any) -> Callable[
     """
 
     def check(name: str, params: np.ndarray, **bounds: tuple[int, int]) -> None:
-        module = importlib.import_module(f"controller.laws.{name}")
+        module = importlib.import_module(f"ato_hil.controller.laws.{name}")
 
         @given(records(module.STATE, **bounds), records(CELL), records(INPUTS))
         def holds(state: np.ndarray, cell: np.ndarray, inputs: np.ndarray) -> None:
             checked = [state.copy(), cell.copy(), np.zeros(1, OUTPUTS)]
-            function = f"controller.laws.{name}:{name}"
+            function = f"ato_hil.controller.laws.{name}:{name}"
             interpreted(function, params, checked[0], checked[1], inputs, checked[2])
             outputs, cells, after = run_law(name, params, inputs, state, cell)
             compiled = (after, cells, outputs)

@@ -4,8 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from controller.laws import adaptive
-from controller.quantise import CalibrationError, Vehicle
+from ato_hil.controller.laws import adaptive
+from ato_hil.controller.quantise import CalibrationError, Vehicle
 
 SMOOTH = {"alpha": 8.0, "g0": 4e5, "g1": 0.1, "g2": 100.0, "eps1": 10.0}
 JITTER = SMOOTH | {"eps1": 3.0}

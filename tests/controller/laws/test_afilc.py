@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller.interface import FAULT_BARRIER
-from controller.laws import afilc
-from controller.memory import CELL
-from controller.quantise import CalibrationError, Vehicle
+from ato_hil.controller.interface import FAULT_BARRIER
+from ato_hil.controller.laws import afilc
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.quantise import CalibrationError, Vehicle
 
 TRAIN = Vehicle(mass_kg=350e3, period_s=0.01, force_max_m_s2=1.49)
 STRONG = Vehicle(350e3, 0.01, 15.9)  # so that fewer inputs end at the limit

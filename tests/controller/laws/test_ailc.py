@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from controller.laws import ailc, cailc
-from controller.memory import CELL
-from controller.q import INT32_MAX, INT32_MIN
-from controller.quantise import CalibrationError, Vehicle
+from ato_hil.controller.laws import ailc, cailc
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.q import INT32_MAX, INT32_MIN
+from ato_hil.controller.quantise import CalibrationError, Vehicle
 
 PAPER = {
     "alpha": 8.0,

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.interface import FAULT_BARRIER
-from controller.laws import cailc
-from controller.memory import CELL
-from controller.quantise import CalibrationError, Vehicle
+from ato_hil.controller.interface import FAULT_BARRIER
+from ato_hil.controller.laws import cailc
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.quantise import CalibrationError, Vehicle
 
 PAPER = {
     "alpha": 8.0,

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller.interface import INPUTS
-from controller.laws import drac, drac_robust
-from controller.memory import CELL
-from controller.q import INT32_MAX
-from controller.quantise import CalibrationError, Characteristic, Vehicle
-from plant_sim.scenario import load
+from ato_hil.controller.interface import INPUTS
+from ato_hil.controller.laws import drac, drac_robust
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.q import INT32_MAX
+from ato_hil.controller.quantise import CalibrationError, Characteristic, Vehicle
+from ato_hil.plant_sim.scenario import load
 
 MASS_KG = 510e3
 FORCE = Characteristic(force_n=300e3, slope_n_s_m=1022.4, power_w=8844500.0)
@@ -382,7 +382,12 @@ def assert_bits(name, gains, ticks, interpreted, run_law):
     cell, output = np.zeros(1, CELL), np.zeros(1, outputs.dtype)
     for k in range(ticks):
         interpreted(
-            f"controller.laws.{name}:{name}", params, checked, cell, inputs[k : k + 1], output
+            f"ato_hil.controller.laws.{name}:{name}",
+            params,
+            checked,
+            cell,
+            inputs[k : k + 1],
+            output,
         )
         assert output.tobytes() == outputs[k : k + 1].tobytes(), k
     assert state.tobytes() == checked.tobytes()

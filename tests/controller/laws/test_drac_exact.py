@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from controller.laws import drac_exact
-from controller.q import INT32_MAX
-from controller.quantise import CalibrationError, Vehicle
+from ato_hil.controller.laws import drac_exact
+from ato_hil.controller.q import INT32_MAX
+from ato_hil.controller.quantise import CalibrationError, Vehicle
 
 STRONG = Vehicle(510e3, 0.01, 15.9)  # so that fewer inputs end at the limit
 THETA = (7.75, 0.06327, 0.00128)

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from can_dbc.step import step
-from controller.laws import drac, drac_robust
-from controller.q import INT32_MAX
-from controller.quantise import CalibrationError, Characteristic, Vehicle
+from ato_hil.can_dbc.step import step
+from ato_hil.controller.laws import drac, drac_robust
+from ato_hil.controller.q import INT32_MAX
+from ato_hil.controller.quantise import CalibrationError, Characteristic, Vehicle
 
 TRAIN = Vehicle(510e3, 0.01, 0.6, Characteristic(300e3, 1022.4, 8844500.0))
 DEFAULT: dict[str, Any] = {

@@ -7,12 +7,12 @@ import sys
 import numpy as np
 import pytest
 
-from can_dbc.step import step
-from controller import memory
-from controller.laws import iplc, norm_optimal
-from controller.memory import CELL
-from controller.quantise import CalibrationError, Vehicle
-from tools.verify.references.iplc import REFERENCES
+from ato_hil.can_dbc.step import step
+from ato_hil.controller import memory
+from ato_hil.controller.laws import iplc, norm_optimal
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.quantise import CalibrationError, Vehicle
+from ato_hil.tools.papers.iplc.reference import REFERENCES
 
 REAL_FORCE = REFERENCES["iplc"].force
 PERIOD_S = 0.01
@@ -317,10 +317,10 @@ def test_no_input_overflows(name, train, check_every_input):
 
 DIVIDING = """
 import numpy as np
-from controller.interface import INPUTS, OUTPUTS
-from controller.laws import iplc
-from controller.memory import CELL
-from controller.quantise import Vehicle
+from ato_hil.controller.interface import INPUTS, OUTPUTS
+from ato_hil.controller.laws import iplc
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.quantise import Vehicle
 
 class Divided(Exception):
     pass

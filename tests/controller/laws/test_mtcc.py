@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller.interface import FAULT_BARRIER
-from controller.laws import mtcc
-from controller.q import INT32_MAX
-from controller.quantise import CalibrationError, Vehicle
+from ato_hil.controller.interface import FAULT_BARRIER
+from ato_hil.controller.laws import mtcc
+from ato_hil.controller.q import INT32_MAX
+from ato_hil.controller.quantise import CalibrationError, Vehicle
 
 TRAIN = Vehicle(200e3, 0.01, 1.5)
 STRONG = Vehicle(200e3, 0.01, 15.9)  # so that fewer inputs end at the limit

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from controller.laws import mtcc_pid
-from controller.laws.mtcc_pid import TOTAL_MAX
-from controller.q import INT32_MAX
-from controller.quantise import CalibrationError, Vehicle
+from ato_hil.controller.laws import mtcc_pid
+from ato_hil.controller.laws.mtcc_pid import TOTAL_MAX
+from ato_hil.controller.q import INT32_MAX
+from ato_hil.controller.quantise import CalibrationError, Vehicle
 
 TRAIN = Vehicle(200e3, 0.01, 1.5)
 FIRST = {"Kp": 0.05, "Ki": 0.01, "Kd": 0.03}  # of the leader

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from controller.laws import p_ilc
-from controller.memory import CELL
-from controller.quantise import CalibrationError, Vehicle
+from ato_hil.controller.laws import p_ilc
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.quantise import CalibrationError, Vehicle
 
 TRAIN = Vehicle(mass_kg=350e3, period_s=0.01, force_max_m_s2=1.49)
 RESISTANCE = (8.5e-3, 2.59e-4, 1.43e-5)

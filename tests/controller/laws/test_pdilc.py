@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from controller import memory
-from controller.laws import pdilc, pid
-from controller.memory import CELL
-from controller.quantise import CalibrationError, Vehicle
+from ato_hil.controller import memory
+from ato_hil.controller.laws import pdilc, pid
+from ato_hil.controller.memory import CELL
+from ato_hil.controller.quantise import CalibrationError, Vehicle
 
 PAPER = {"kp": 1.05e5, "kD": 1.0, "gp": 300201.0, "gI": 1.0, "gD": 10.0}
 GAINS = pdilc.Gains(**PAPER)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from controller.laws import pid
-from controller.quantise import CalibrationError, Vehicle
+from ato_hil.controller.laws import pid
+from ato_hil.controller.quantise import CalibrationError, Vehicle
 
 GAINS = pid.Gains(gp=300201.0, gI=1.0, gD=10.0)
 LARGE_GAINS = pid.Gains(gp=300201.0, gI=70.0, gD=2e5)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from controller.laws import pid_feedforward
-from controller.q import INT32_MAX
-from controller.quantise import CalibrationError, Characteristic, Vehicle
+from ato_hil.controller.laws import pid_feedforward
+from ato_hil.controller.q import INT32_MAX
+from ato_hil.controller.quantise import CalibrationError, Characteristic, Vehicle
 
 TRAIN = Vehicle(510e3, 0.01, 0.6, Characteristic(300e3, 1022.4, 8844500.0))
 STRONG = Vehicle(510e3, 0.01, 15.9)  # so that fewer inputs end at the limit

@@ -1,0 +1,139 @@
+"""The commands that do not run a session: list, doctor, compare, claims."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ato_hil.plant_sim.scenario import scenario_names
+
+
+def test_list_names_every_scenario(ato_hil, tmp_path: Path) -> None:
+    done = ato_hil("list", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for name in scenario_names():
+        assert name in done.stdout
+
+
+def test_doctor_finds_this_machine_fit(ato_hil, tmp_path: Path) -> None:
+    done = ato_hil("doctor", cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for what in ("compiler", "compiler cache", "DBC", "bus hub", "bus socketcan:vcan0", "viewer"):
+        assert what in done.stdout
+    assert "broken" not in done.stdout
+
+
+def test_compare_lays_laws_side_by_side(ato_hil, short_text, tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text(short_text)
+    done = ato_hil("compare", "short.toml", "--laws", "cailc,pid", "--out", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "out" / "compare.json").read_text())["rows"]
+    assert [(row["law"], row["run"]) for row in rows] == [
+        ("cailc", 1),
+        ("cailc", 2),
+        ("pid", 1),
+        ("pid", 2),
+    ]
+    assert rows[1]["rms_position_error_m"] < rows[0]["rms_position_error_m"]
+    assert rows[2]["max_position_error_m"] > 10 * rows[0]["max_position_error_m"]
+    from rerun.chunk import RrdReader
+
+    entities = {
+        str(chunk.entity_path) for chunk in RrdReader(tmp_path / "out" / "trace.rrd").stream()
+    }
+    assert "/truth/position_error_m/cailc" in entities
+    assert "/truth/position_error_m/pid" in entities
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["compare", "subway", "--laws", "cailc,magic"], "no gains for law 'magic'"),
+        (["compare", "nowhere", "--laws", "cailc"], "scenario 'nowhere' is unknown"),
+        (["claims", "nothing"], "no claims of 'nothing', expected one of afilc, cailc, drac"),
+        (["claims", "cailc", "--json", "no/such/file.json"], "no/such/file.json: no such folder"),
+        (["replay", "none.blf"], "none.blf: cannot be read: No such file or directory"),
+        (["decode", "none.log", "--out", "x.csv"], "none.log: cannot be read: No such file"),
+    ],
+)
+def test_bad_input_is_one_clear_line(
+    ato_hil, tmp_path: Path, arguments: list[str], says: str
+) -> None:
+    done = ato_hil(*arguments, cwd=tmp_path)
+    assert done.returncode == 1
+    assert says in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_recording_is_replayed_and_decoded(ato_hil, recorded: Path, tmp_path: Path) -> None:
+    done = ato_hil("replay", str(recorded), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        "short, cailc: 2 runs",
+        "run 1: 2001 ticks, 3404 commands as recorded",
+        "run 2: 2001 ticks, 3404 commands as recorded",
+    ]
+    done = ato_hil("decode", str(recorded), "--out", "table.csv", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    frames = len((tmp_path / "table.csv").read_text().splitlines()) - 1
+    assert done.stdout == f"table.csv: {frames} frames, 8 messages\n"
+
+
+def test_a_command_that_differs_ends_the_replay(ato_hil, recorded: Path, tmp_path: Path) -> None:
+    lines = recorded.read_text().splitlines(keepends=True)
+    (at, *_) = [i for i, line in enumerate(lines) if "(0.100000) can0 0C0#" in line]
+    lines[at] = lines[at][:-4] + "1 R\n"
+    (tmp_path / "other.log").write_text("".join(lines))
+    scenario = str(recorded.with_name("short.toml"))
+    done = ato_hil("replay", "other.log", "--scenario", scenario, cwd=tmp_path)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("ato-hil: other.log: run 1, tick 10: FORCE_CMD.Tick is 10, recorded ")
+
+
+def test_the_profile_has_the_limit_that_follows_the_reference(ato_hil, tmp_path: Path) -> None:
+    done = ato_hil("profile", "crh3-learning", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) == 250_002
+    for line in lines[1::10_000]:
+        _tick, _position, speed, _acceleration, permitted = map(float, line.split(","))
+        assert permitted - speed == pytest.approx(2 / 3.6, abs=2e-7)
+
+
+def test_the_profile_of_a_run_is_on_its_own_timetable(ato_hil, short_text, tmp_path: Path) -> None:
+    """Run 1 takes 24 s instead of 20 s, and is as much slower."""
+    lengths = "[run_length]\nshortest_s = 18.0\nlongest_s = 25.0\nfirst_s = 24.0\n"
+    (tmp_path / "late.toml").write_text(f'{short_text}\n{lengths}reading = "stretched"\n')
+    tables = []
+    for options in ((), ("--run", "1")):
+        done = ato_hil("profile", "late.toml", *options, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        lines = done.stdout.splitlines()[1:]
+        tables.append(np.array([list(map(float, line.split(","))) for line in lines]))
+    planned, late = tables
+    assert (planned[-1, 0], late[-1, 0]) == (2000, 2400)
+    assert late[-1, 1:4].tolist() == planned[-1, 1:4].tolist()
+    assert late[::6, 1] == pytest.approx(planned[::5, 1], abs=1e-4)
+    assert late[::6, 2] == pytest.approx(planned[::5, 2] / 1.2, abs=1e-4)
+    assert late[::6, 4].tolist() == planned[::5, 4].tolist()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("paper", "least"), [("cailc", 20), ("drac", 15), ("mtcc", 25), ("afilc", 20), ("iplc", 25)]
+)
+def test_the_claims_of_a_paper_come_out_as_found(
+    ato_hil, tmp_path: Path, paper: str, least: int
+) -> None:
+    done = ato_hil("claims", paper, "--json", "claims.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "claims.json").read_text())["claims"]
+    assert len(rows) >= least
+    assert all(row["holds"] == row["expected"] for row in rows)
+    assert any(not row["holds"] for row in rows)
+    assert all(math.isfinite(row["measured"]) for row in rows)

@@ -1,0 +1,201 @@
+"""How fast the bench is, as ratios to a peer in the same run: HIL against a bare python-can echo,
+SIL against python-control."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import tempfile
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+
+from ato_hil.can_dbc.bus import choose_bus, open_bus
+from ato_hil.can_dbc.child import python
+from ato_hil.plant_sim.scenario import load
+from ato_hil.tools.runs import onboard
+from ato_hil.tools.session import session, sil
+from ato_hil.tools.trace import live_viewer
+
+SCENARIO = "subway-fast"
+HIL_SCENARIO = "subway"
+LEARNING_SCENARIO = "crh3-learning"
+TICKS_OF_PEER = 4000
+# What HIL moves in a tick of `subway`: frames to the controller, frames back.
+FRAMES_THERE, FRAMES_BACK = 3, 4
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measurement and its peer."""
+
+    what: str
+    ticks_per_s: float
+    peer: str
+    peer_ticks_per_s: float
+
+    @property
+    def ratio(self) -> float:
+        """How many times the peer's rate; nan without a peer."""
+        return self.ticks_per_s / self.peer_ticks_per_s
+
+
+class _Silent:
+    """Watches a session without a word."""
+
+    def begin(self, *_: Any) -> None: ...
+    def note(self, text: str) -> None: ...
+    def progress(self, run: int, tick: int) -> None: ...
+    def row(self, row: dict[str, Any]) -> None: ...
+
+
+def measure(bus: str) -> list[Figure]:
+    """SIL and HIL rates with their peers."""
+    peer = control_rate()
+    figures = [
+        Figure("SIL, whole chain, traces off", sil_rate(), "python-control", peer),
+        Figure("SIL, 250 000 ticks a run, whole session", session_rate(), "python-control", peer),
+        Figure(
+            "HIL, three processes, trace on", hil_rate(bus), "bare python-can echo", echo_rate(bus)
+        ),
+    ]
+    with suppress(live_viewer.ViewerError):  # without a viewer there is nothing to measure
+        alone, watched = watched_rates(bus)
+        figures.append(Figure("HIL, viewer looking on", watched, "HIL without it", alone))
+    return figures
+
+
+def watched_rates(bus: str) -> tuple[float, float]:
+    """Rates of HIL without and with a viewer that draws what comes, ticks/s: the better of two
+    sessions each, in turns; what else the machine does only slows them."""
+    alone, watched = [], []
+    for _ in range(2):
+        alone.append(hil_rate(bus))
+        with live_viewer.LiveView(live_viewer.HEADLESS) as viewer:
+            watched.append(hil_rate(bus, viewer))
+    return max(alone), max(watched)
+
+
+def sil_rate() -> float:
+    """Median rate of five runs of the lumped subway train, ticks/s."""
+    loaded = load(SCENARIO)
+    calibration = onboard.calibration_for(loaded, "cailc")
+    rates = [
+        loaded.ticks / result.seconds
+        for result, _node in sil.run(loaded, calibration, runs=range(1, 6), seed=1)
+    ]
+    return float(np.median(rates))
+
+
+def session_rate() -> float:
+    """Rate of runs 2 to 5 of the fuzzy learning law on the noisy 52 km, ticks/s: chance, loop,
+    digest and metrics counted."""
+    marks: list[float] = []
+
+    class Clock(_Silent):
+        def row(self, row: dict[str, Any]) -> None:
+            marks.append(time.perf_counter())
+            ticks.append(row["ticks"])
+
+    ticks: list[int] = []
+    with tempfile.TemporaryDirectory(prefix="ato-hil-") as folder:
+        options = session.Options(
+            LEARNING_SCENARIO, None, 5, "sil", "none", 1, Path(folder), None, trace=False
+        )
+        session.run(options, Clock())
+    return sum(ticks[1:]) / (marks[-1] - marks[0])
+
+
+def control_rate() -> float:
+    """The same loop, plant and law in floats, simulated by python-control; nan if that is not
+    installed."""
+    try:
+        import control
+    except ImportError:
+        return math.nan
+    loaded = load(SCENARIO)
+    mass = loaded.scenario.train.mass_kg
+    alpha, beta = 8.0, 1.1e5
+    reference = loaded.profile
+    r1, r2, r3 = loaded.scenario.laws["cailc"]["Xi_initial"]
+
+    def update(_t: float, x: Any, u: Any, _params: Any) -> Any:
+        position, speed = x
+        e, ed = position - u[0], speed - u[1]
+        delta = alpha * e + ed
+        resistance = r1 + r2 * speed + r3 * speed * speed
+        force = resistance + mass * u[2] - mass * alpha * ed - beta * delta
+        for _ in range(5):
+            pull = (force - (r1 + r2 * speed + r3 * speed * speed)) / mass
+            middle = speed + 0.001 * pull
+            pull = (force - (r1 + r2 * middle + r3 * middle * middle)) / mass
+            position, speed = position + 0.002 * middle, max(speed + 0.002 * pull, 0.0)
+        return [position, speed]
+
+    system = control.NonlinearIOSystem(
+        update, lambda _t, x, _u, _p: x, inputs=3, outputs=2, states=2, dt=0.01
+    )
+    times = np.arange(TICKS_OF_PEER) * 0.01
+    inputs = np.vstack(
+        [
+            column[:TICKS_OF_PEER]
+            for column in (reference.position_m, reference.speed_m_s, reference.acceleration_m_s2)
+        ]
+    )
+    started = time.perf_counter()
+    control.input_output_response(system, times, inputs, [0.0, 0.0])
+    return TICKS_OF_PEER / (time.perf_counter() - started)
+
+
+def hil_rate(bus: str, viewer: live_viewer.LiveView | None = None) -> float:
+    """Median rate of three HIL runs with recorder and trace, ticks/s."""
+    with tempfile.TemporaryDirectory(prefix="ato-hil-") as folder:
+        options = session.Options(
+            HIL_SCENARIO, None, 3, "hil", bus, 1, Path(folder), None, viewer=viewer
+        )
+        summary = session.run(options, _Silent())
+    return float(np.median([row["ticks_per_s"] for row in summary["runs"]]))
+
+
+def echo_rate(bus: str) -> float:
+    """As many frames there and back as in HIL, by python-can's own send and recv, without any
+    control."""
+    name = choose_bus(bus).name
+    child = subprocess.Popen(
+        python("-c", f"from ato_hil.tools.bench.bench import echo; echo({name!r})"),
+        stdout=subprocess.PIPE,
+    )
+    assert child.stdout is not None
+    child.stdout.readline()
+    messages = [
+        can.Message(arbitration_id=i, data=bytes(8), is_extended_id=False) for i in range(3)
+    ]
+    try:
+        with open_bus(name) as here:
+            started = time.perf_counter()
+            for _ in range(TICKS_OF_PEER):
+                for message in messages:
+                    here.send(message)
+                for _answer in range(FRAMES_BACK):
+                    here.recv(1.0)
+            return TICKS_OF_PEER / (time.perf_counter() - started)
+    finally:
+        child.kill()
+        child.wait()
+
+
+def echo(name: str) -> None:
+    """The other end of `echo_rate`: answers every third frame with four."""
+    answer = can.Message(arbitration_id=0x100, data=bytes(8), is_extended_id=False)
+    with open_bus(name) as bus:
+        print("ready", flush=True)
+        while True:
+            for _ in range(FRAMES_THERE):
+                bus.recv()
+            for _ in range(FRAMES_BACK):
+                bus.send(answer)

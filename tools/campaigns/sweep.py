@@ -1,0 +1,244 @@
+"""A sweep: one scenario with numbers varied, the combinations side by side on all cores (SIL).
+
+Each combination is a process of its own; what they compile is compiled once, before. A row of the
+table is the last run of a combination; the plot shows energy against error, and which rows no other
+row beats in both.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import multiprocessing
+import os
+import signal
+import tomllib
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ato_hil.can_dbc.child import safe_path
+from ato_hil.can_dbc.errors import InputError
+from ato_hil.controller.registry import law_label
+from ato_hil.plant_sim.scenario import (
+    Loaded,
+    load,
+    members,
+    overlaid,
+)
+from ato_hil.tools.runs import onboard, summary_row
+from ato_hil.tools.runs.files import write_text
+from ato_hil.tools.session import sil
+
+CASE = "case"  # the key that varies the scenario's named case
+LAW = "law."  # short for laws.<the law>.
+ENERGY, ERROR = "energy_kwh_per_t", "rms_position_error_m"
+
+
+class SweepError(InputError):
+    """The sweep cannot be made; one line."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One combination of the varied values."""
+
+    values: dict[str, Any]  # by key as the user gave it
+    scenario: str
+    overlay: dict[str, Any]
+    law: str
+    runs: int
+    seed: int
+
+
+def parse_vary(text: str) -> tuple[str, list[Any]]:
+    """`law.S=0,0.5,1` as key and values, TOML values or bare words. Raises SweepError."""
+    key, separator, listed = text.partition("=")
+    if not separator or not key or not listed.strip():
+        raise SweepError(f"--vary {text!r}: expected KEY=VALUE,VALUE, e.g. law.S=0,0.5,1")
+    try:
+        values = tomllib.loads(f"values = [{listed}]")["values"]
+    except tomllib.TOMLDecodeError:
+        values = [word.strip() for word in listed.split(",")]
+    if not values or "" in values:
+        raise SweepError(f"--vary {text!r}: a value is empty")
+    if key == CASE:
+        values = [str(value) for value in values]
+    return key, values
+
+
+def plan(
+    scenario: str, law: str | None, vary: list[str], runs: int | None, seed: int
+) -> list[Point]:
+    """The combinations, each checked to load and to calibrate.
+
+    Raises SweepError, ScenarioError or LawError with one line that names the value.
+    """
+    varied = [parse_vary(text) for text in vary]
+    keys = [key for key, _values in varied]
+    if twice := {key for key in keys if keys.count(key) > 1}:
+        raise SweepError(f"--vary {min(twice)} is given twice")
+    points = []
+    for combination in itertools.product(*(values for _key, values in varied)):
+        values = dict(zip(keys, combination, strict=True))
+        name = f"{scenario}:{values[CASE]}" if CASE in values else scenario
+        default = load(name).scenario
+        chosen = law or default.law
+        overlay: dict[str, Any] = {}
+        for key, value in values.items():
+            if key != CASE:
+                _put(overlay, key, chosen, value)
+        loaded = overlaid(name, overlay)
+        onboard.calibration_for(loaded, chosen)
+        points.append(Point(values, name, overlay, chosen, runs or default.runs, seed))
+    return points
+
+
+def _put(overlay: dict[str, Any], key: str, law: str, value: Any) -> None:
+    """Sets the dotted key of a scenario in nested tables."""
+    *tables, last = key.removeprefix(LAW).split(".") if key.startswith(LAW) else key.split(".")
+    if key.startswith(LAW):
+        tables = ["laws", law_label(law), *tables]
+    for table in tables:
+        overlay = overlay.setdefault(table, {})
+        if not isinstance(overlay, dict):
+            raise SweepError(f"--vary {key}: {table!r} is varied as a whole, too")
+    overlay[last] = value
+
+
+def sweep(points: list[Point]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """(index of the point, row) of each point as it is done, on all cores."""
+    _compile(points)
+    workers = min(os.cpu_count() or 1, len(points))
+    context = multiprocessing.get_context("spawn")
+    with safe_path():
+        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_interrupts)
+        waiting = {pool.submit(measure, point): index for index, point in enumerate(points)}
+    try:
+        for done in as_completed(waiting):
+            yield waiting[done], done.result()
+    except BrokenProcessPool:
+        raise SweepError("a process of the sweep was killed; nothing was written") from None
+    except BaseException:
+        for child in multiprocessing.active_children():
+            child.terminate()  # they write no file
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _leave_interrupts() -> None:
+    """Ctrl-C is for the process that started this one, which then ends it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _compile(points: list[Point]) -> None:
+    """The steps of every law and train model among the points, so that no two processes compile
+    the same."""
+    seen = set()
+    for point in points:
+        loaded = overlaid(point.scenario, point.overlay)
+        what = (point.law, type(loaded.scenario.train))
+        if what not in seen:
+            seen.add(what)
+            nodes = onboard.controllers_for(members(loaded), point.law)
+            for _results in sil.run_line(loaded, nodes, runs=range(0), seed=point.seed):
+                pass
+
+
+def measure(point: Point) -> dict[str, Any]:
+    """The row of one point: its values, and the metrics of its last run, of a line the worst."""
+    loaded = overlaid(point.scenario, point.overlay)
+    trains = members(loaded)
+    nodes = onboard.controllers_for(trains, point.law)
+    numbers = onboard.run_numbers(point.law, point.runs)
+    row: dict[str, Any] = {}
+    for results in sil.run_line(loaded, nodes, runs=numbers, seed=point.seed):
+        if results[0].run == numbers[-1]:
+            row = {"run": numbers[-1], **summary_row.row_of(trains, point.law, results)}
+            faults = (name for result in results for name in result.faults)
+            row["faults"] = ", ".join(dict.fromkeys(faults))
+    row.pop("trains", None)
+    return {**{key: _plain(value) for key, value in point.values.items()}, **row}
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, list | dict) else value
+
+
+def pareto(rows: list[dict[str, Any]]) -> list[int]:
+    """Indices of the rows that no other beats in energy and error, by rising energy."""
+    order = sorted(range(len(rows)), key=lambda i: (rows[i][ENERGY], rows[i][ERROR]))
+    front: list[int] = []
+    for index in order:
+        if not front or rows[index][ERROR] < rows[front[-1]][ERROR]:
+            front.append(index)
+    return front
+
+
+def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
+    """The rows as CSV, whole or not at all."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
+
+
+def label(row: dict[str, Any], keys: list[str]) -> str:
+    """The varied values of a row: `L 3, S 0.5`; a case stands for itself."""
+    return ", ".join(
+        str(row[key]) if key == CASE else f"{key.rpartition('.')[2]} {row[key]}" for key in keys
+    )
+
+
+# Where the labels of the first, second ... series stand: offset in points, alignment.
+LABELS = (((7, 3), "left"), ((-7, -9), "right"), ((7, -9), "left"), ((-7, 3), "right"))
+
+
+def plot(path: Path, loaded: Loaded, rows: list[dict[str, Any]], keys: list[str]) -> None:
+    """Energy against error, one point a row; the Pareto front as a line. PNG or SVG by suffix.
+
+    What is varied last labels the points, what is varied before makes series of them.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    matplotlib.rcParams["svg.hashsalt"] = "ato-hil"  # the same file each time
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7.5, 5.0), layout="constrained")
+    front = [rows[index] for index in pareto(rows)]
+    axes.plot([r[ENERGY] for r in front], [r[ERROR] for r in front], "-", color="0.8", zorder=1)
+    series: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        series.setdefault(label(row, keys[:-1]), []).append(row)
+    for (name, of_series), (offset, side) in zip(
+        series.items(), itertools.cycle(LABELS), strict=False
+    ):
+        energy, error = ([row[key] for row in of_series] for key in (ENERGY, ERROR))
+        axes.scatter(energy, error, s=30, zorder=2, label=name)
+        for row in of_series:
+            axes.annotate(
+                label(row, keys[-1:]),
+                (row[ENERGY], row[ERROR]),
+                xytext=offset,
+                textcoords="offset points",
+                horizontalalignment=side,
+                fontsize=8,
+            )
+    if len(series) > 1:
+        axes.legend(frameon=False)
+    axes.set_yscale("log")
+    axes.set_xlabel("traction energy of the last run [kWh/t]")
+    axes.set_ylabel("rms position error of the last run [m]")
+    axes.set_title(f"{loaded.name}: energy against error, run {rows[0]['run']}", fontsize=11)
+    axes.grid(True, which="both", color="0.92")
+    axes.set_axisbelow(True)
+    axes.margins(x=0.12)
+    figure.savefig(path, dpi=130, metadata={"Date": None} if path.suffix == ".svg" else {})
+    pyplot.close(figure)

@@ -1,0 +1,159 @@
+"""What works on this machine: compiler, its cache, buses, viewer."""
+
+from __future__ import annotations
+
+import platform
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+VULKAN_DRIVERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    state: str  # works | absent (optional) | broken (needed)
+    text: str
+
+
+def examine() -> list[Finding]:
+    """All findings, in the order in which a run needs them."""
+    return [
+        _python(),
+        _compiler(),
+        _cache(),
+        _dbc(),
+        _hub(),
+        _vcan0(),
+        _private_vcan(),
+        _viewer(),
+        _pictures(),
+    ]
+
+
+def _python() -> Finding:
+    return Finding(
+        "Python", "works", f"{platform.python_version()} on {platform.machine()}, {sys.platform}"
+    )
+
+
+def _compiler() -> Finding:
+    try:
+        import numba
+
+        from ato_hil.can_dbc.step import int64, step
+
+        @step
+        def probe(value: int) -> int:
+            return int64(value) + 1
+
+        right = probe(41) == 42
+    except Exception as error:  # whatever the compiler raises is the finding
+        return Finding(
+            "compiler", "broken", f"numba cannot compile here: {' '.join(str(error).split())[:200]}"
+        )
+    return Finding(
+        "compiler", "works" if right else "broken", f"numba {numba.__version__} compiled a step"
+    )
+
+
+def _cache() -> Finding:
+    from ato_hil.can_dbc.step import cache_directory
+
+    folder = cache_directory()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        return Finding(
+            "compiler cache",
+            "broken",
+            f"{folder}: {error.strerror}; set NUMBA_CACHE_DIR to a folder that can be written",
+        )
+    return Finding(
+        "compiler cache",
+        "works",
+        f"{folder} can be written; the first run compiles, later ones load",
+    )
+
+
+def _dbc() -> Finding:
+    try:
+        from ato_hil.can_dbc.codec import MESSAGE_COUNT
+        from ato_hil.can_dbc.step import dbc_path
+    except ValueError as error:
+        return Finding("DBC", "broken", str(error))
+    return Finding("DBC", "works", f"{dbc_path().name}: {MESSAGE_COUNT} messages")
+
+
+def _hub() -> Finding:
+    import can
+
+    from ato_hil.can_dbc.bus import (
+        BusError,
+        open_bus,
+        recv_frames,
+        send_frames,
+    )
+
+    try:
+        with open_bus("hub:doctor") as one, open_bus("hub:doctor") as other:
+            send_frames(one, [(0x7FF, 1)])
+            heard = recv_frames(other, 1.0) == [(0x7FF, 1)]
+    except (BusError, can.CanError, OSError) as error:
+        return Finding("bus hub", "broken", f"the embedded hub does not work here: {error}")
+    return Finding("bus hub", "works" if heard else "broken", "a frame went from node to node")
+
+
+def _vcan0() -> Finding:
+    from ato_hil.can_dbc.bus import small_buffer_reason, socketcan_reason
+
+    reason = socketcan_reason("vcan0")
+    if not reason:
+        text = "; ".join(filter(None, ("`auto` takes it", small_buffer_reason())))
+        return Finding("bus socketcan:vcan0", "works", f"the interface exists; {text}")
+    return Finding(
+        "bus socketcan:vcan0",
+        "absent",
+        f"{reason}; on a kernel with CAN: sudo modprobe vcan;"
+        " sudo ip link add dev vcan0 type vcan; sudo ip link set up vcan0",
+    )
+
+
+def _private_vcan() -> Finding:
+    from ato_hil.can_dbc.bus import private_vcan_reason, small_buffer_reason
+
+    if reason := private_vcan_reason():
+        return Finding("bus vcan", "absent", reason)
+    text = "; ".join(filter(None, ("a private vcan was made", small_buffer_reason())))
+    return Finding("bus vcan", "works", text)
+
+
+def _viewer() -> Finding:
+    from ato_hil.tools.trace import live_viewer
+
+    try:
+        live_viewer.binary()
+    except live_viewer.ViewerError as error:
+        return Finding("viewer", "absent", str(error))
+    if not live_viewer.has_screen():
+        return Finding("viewer", "works", "there is no screen here: `--view web`, `view --web`")
+    return Finding("viewer", "works", "it is installed; `--view`, `ato-hil view DIR`")
+
+
+def _pictures() -> Finding:
+    """Without a graphics card the viewer draws with Vulkan in software."""
+    found = [path for folder in VULKAN_DRIVERS for path in Path(folder).glob("*.json")]
+    if sys.platform == "linux" and not found:
+        return Finding(
+            "pictures of the viewer",
+            "absent",
+            "no Vulkan driver, which `view --screenshot` needs:"
+            " apt-get install mesa-vulkan-drivers",
+        )
+    return Finding("pictures of the viewer", "works", "`view --screenshot` can draw")

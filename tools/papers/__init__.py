@@ -1,0 +1,1 @@
+"""Each paper's claims, figures and float64 reference, side by side in a folder of its own."""

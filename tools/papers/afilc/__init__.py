@@ -1,0 +1,1 @@
+"""Paper 4: fuzzy iterative learning with varying run lengths."""

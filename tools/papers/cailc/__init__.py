@@ -1,0 +1,1 @@
+"""Paper 1: adaptive iterative learning under a speed limit, a multi-car subway train."""

@@ -1,0 +1,1 @@
+"""Paper 2: robust adaptive backstepping, a high-speed train."""

@@ -1,0 +1,1 @@
+"""Paper 5: predictive learning that trades error for energy."""

@@ -1,0 +1,1 @@
+"""Paper 3: cooperative control of five trains with position barriers."""

@@ -1,0 +1,91 @@
+"""One row of the summary: what a run was like, from the true state of the plant.
+
+Errors are of the true state against the reference, over the scenario's window; everything else is
+over the whole run.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ato_hil.plant_sim.atp import EMERGENCY_BRAKE, SERVICE_BRAKE
+from ato_hil.plant_sim.scenario import Loaded
+
+
+def run_metrics(
+    loaded: Loaded, truth: np.ndarray, command_n: np.ndarray, alpha: float | None
+) -> dict[str, Any]:
+    """Metrics of one run, keys with units.
+
+    `truth` [ticks] of plant.TRUTH; `command_n` [ticks] total force commanded, N; `alpha` (1/s)
+    weighs the position error in the augmented error delta = alpha e + ed, None for laws without it
+    (delta is then reported as null).
+    """
+    scenario = loaded.scenario
+    ticks = len(truth)
+    reference = loaded.profile
+    position_error = truth["position_m"] - reference.position_m[:ticks]
+    speed_error = truth["speed_m_s"] - reference.speed_m_s[:ticks]
+    first = round(scenario.metrics.from_s / scenario.period_s)
+    last = min(ticks, scenario.metrics.to_s / scenario.period_s + 1)
+    window = slice(first, int(last))
+    e, ed = position_error[window], speed_error[window]
+    mass = scenario.train.mass_kg
+    tonnes = mass / 1000.0
+    work = {
+        name: float(truth[f"{name}_j"][-1]) / 3.6e6 / tonnes
+        for name in ("traction", "braking", "recuperated")
+    }
+    jerk = np.diff(command_n) / (mass * scenario.period_s)
+    row = {
+        "ticks": ticks,
+        "max_delta_m_s": None if alpha is None else _peak(alpha * e + ed),
+        "max_speed_error_m_s": _peak(ed),
+        "max_position_error_m": _peak(e),
+        "rms_speed_error_m_s": _rms(ed),
+        "rms_position_error_m": _rms(e),
+        "rms_delta_m_s": None if alpha is None else _rms(alpha * e + ed),
+        "stop_error_m": float(position_error[-1]),
+        "max_acceleration_m_s2": _peak(truth["acceleration_m_s2"]),
+        "rms_command_jerk_m_s3": _rms(jerk),
+        "overspeed_margin_m_s": float(np.min(truth["permitted_speed_m_s"] - truth["speed_m_s"])),
+        "energy_kwh_per_t": work["traction"],
+        "braking_kwh_per_t": work["braking"],
+        "recuperated_kwh_per_t": work["recuperated"],
+        "net_energy_kwh_per_t": work["traction"] - work["recuperated"],
+    }
+    if scenario.atp.supervision != "none":
+        row |= supervision(truth)
+    return row
+
+
+def supervision(truth: np.ndarray) -> dict[str, Any]:
+    """What ATP did in a run, and the largest speed above each of its curves, 0 for none."""
+    begins = _rises(truth["supervision"] >= SERVICE_BRAKE)
+    over = {
+        f"over_{curve}_m_s": max(float(np.nanmax(truth["speed_m_s"] - limit)), 0.0)
+        for curve in ("permitted", "warning", "service_brake", "emergency_brake")
+        if not np.isnan(limit := truth[f"{curve}_speed_m_s"]).all()
+    }
+    return {
+        "atp_interventions": len(begins),
+        "atp_emergency_brakes": len(_rises(truth["supervision"] == EMERGENCY_BRAKE)),
+        "first_intervention_tick": int(begins[0]) if len(begins) else None,
+        **over,
+    }
+
+
+def _rises(flags: np.ndarray) -> np.ndarray:
+    """The ticks at which a flag comes on."""
+    return np.flatnonzero(np.diff(flags, prepend=False) & flags)
+
+
+def _peak(values: np.ndarray) -> float:
+    return float(np.max(np.abs(values))) if len(values) else 0.0
+
+
+def _rms(values: np.ndarray) -> float:
+    # sqrt of a mean of squares by pairwise sums: NumPy's own, the same on every machine.
+    return float(np.sqrt(np.mean(values * values))) if len(values) else 0.0

@@ -1,0 +1,138 @@
+"""From a scenario to a calibrated controller: the only place that knows both sides."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from ato_hil.controller.calibration import (
+    Calibration,
+    GuardSettings,
+    Line,
+    MemorySettings,
+    calibrate,
+)
+from ato_hil.controller.neighbours import NeighbourSettings
+from ato_hil.controller.node import Controller, build
+from ato_hil.controller.quantise import CalibrationError, Characteristic, Vehicle
+from ato_hil.controller.rebasing import RebasingSettings
+from ato_hil.controller.registry import is_file, law_label, load_law
+from ato_hil.plant_sim import track
+from ato_hil.plant_sim.scenario import Loaded, Scenario, ScenarioError
+from ato_hil.plant_sim.trains import point
+from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
+
+
+def calibration_for(loaded: Loaded, law: str) -> Calibration:
+    """What the controller is flashed with for one law. Raises ScenarioError with file and key.
+
+    A law in a file of its own may do without a table of gains: its defaults count.
+    """
+    scenario = loaded.scenario
+    gains = scenario.laws.get(law_label(law), {} if is_file(law) else None)
+    if gains is None:
+        known = ", ".join(sorted(scenario.laws))
+        raise ScenarioError(f"{loaded.path}: no gains for law {law!r}, the scenario has {known}")
+    distribute = scenario.control.distribute
+    try:
+        return calibrate(
+            law=law,
+            gains=gains,
+            vehicle=vehicle(scenario),
+            profile=loaded.segments,
+            preview_ticks=scenario.control.preview_ticks,
+            memory_settings=_settings("control.memory", scenario.control.memory, MemorySettings),
+            guard_settings=_settings("control.guard", scenario.control.guard, GuardSettings),
+            car_effectiveness=list(scenario.train.effectiveness) if distribute else [],
+            motor_cars=list(scenario.train.motor_cars),
+            car_traction_max_n=scenario.train.traction_max_n,
+            car_brake_max_n=scenario.train.brake_max_n,
+            map_sections=_map_sections(scenario),
+            line=_line(loaded),
+            scenario_digest=loaded.digest,
+        )
+    except CalibrationError as error:
+        raise ScenarioError(f"{loaded.path}: {error}") from None
+
+
+def controllers_for(trains: list[Loaded], law: str) -> list[Controller]:
+    """A controller for each train, without a memory file. Raises ScenarioError as above."""
+    return [build(calibration_for(train, law)) for train in trains]
+
+
+def _line(loaded: Loaded) -> Line | None:
+    """The train's place on the line, and what it makes of its neighbours."""
+    line, control = loaded.scenario.line, loaded.scenario.control
+    if line is None:
+        return None
+    return Line(
+        start_m=loaded.start_m,
+        spacing_m=line.spacing_m,
+        ahead=loaded.train > 0,
+        behind=loaded.train + 1 < line.trains,
+        neighbours=_settings("control.neighbours", control.neighbours, NeighbourSettings),
+        rebasing=_settings("control.rebasing", control.rebasing, RebasingSettings)
+        if control.rebasing is not None
+        else None,
+    )
+
+
+def vehicle(scenario: Scenario) -> Vehicle:
+    """What the controller of a scenario knows of its train."""
+    return Vehicle(
+        scenario.train.mass_kg * (1.0 + scenario.control.mass_error),
+        scenario.period_s,
+        scenario.actuator.force_max_m_s2,
+        _characteristic(scenario),
+    )
+
+
+def _characteristic(scenario: Scenario) -> Characteristic | None:
+    """What the controller knows of the train's traction: all of it."""
+    train = scenario.train
+    if not isinstance(train, point.Train) or train.characteristic is None:
+        return None
+    known = train.characteristic
+    return Characteristic(known.force_n, known.slope_n_s_m, known.power_w)
+
+
+def _map_sections(scenario: Scenario) -> list[tuple[float, float, float]]:
+    """The onboard gradient map: the track's own sections, as far as `control.map_share` says."""
+    factor = scenario.control.map_share * GRAVITY_M_S2 * N_PER_KN
+    if factor == 0:
+        return []
+    return [
+        (
+            float(section["from_m"]),
+            factor * float(section["resistance_n_per_kn"]),
+            factor * float(section["slope_n_per_kn_m"]),
+        )
+        for section in track.sections(scenario.track)[1:]
+    ]
+
+
+def _settings(key: str, values: dict[str, Any], kind: Any) -> Any:
+    try:
+        return msgspec.convert(values, kind)
+    except msgspec.ValidationError as error:
+        raise CalibrationError(f"{key}: {error}") from None
+
+
+def run_numbers(law: str, runs: int, learned: int = -1) -> range:
+    """Numbers of the next `runs` runs: on from the run that a memory file learned last
+    (`learned`), else from 1, after an initial run 0 for laws that learn from one (INITIAL_RUN in
+    their file)."""
+    if learned >= 0:
+        return range(learned + 1, learned + 1 + runs)
+    return range(0 if getattr(load_law(law), "INITIAL_RUN", False) else 1, runs + 1)
+
+
+def error_weight(loaded: Loaded, law: str) -> float | None:
+    """alpha of the augmented error: the law's own, else that of the scenario's default law, else
+    None."""
+    for name in (law, loaded.scenario.law):
+        alpha = loaded.scenario.laws.get(law_label(name), {}).get("alpha")
+        if alpha is not None:
+            return float(alpha)
+    return None

@@ -1,0 +1,90 @@
+"""What the summary and the trace say of a run: of a single train its metrics, of a line the worst
+of its trains, their separation, how far from the barrier they stayed, and each by itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ato_hil.can_dbc.codec import ATO_TRACKING
+from ato_hil.controller.registry import law_label
+from ato_hil.plant_sim.scenario import Loaded, at_rate
+from ato_hil.tools.runs import metrics
+from ato_hil.tools.runs.frames import commanded_force_n, decode, held_values, timetable_rate
+from ato_hil.tools.runs.onboard import error_weight
+from ato_hil.tools.runs.result import RunResult
+
+
+def run_row(
+    members: list[Loaded], law: str, frames: list[np.ndarray], truths: list[np.ndarray]
+) -> dict[str, Any]:
+    """Metrics of one run, keys with units. `frames` and `truths` have an array for each train.
+
+    Errors are against the timetable that the frames announce.
+    """
+    rows = [
+        metrics.run_metrics(
+            at_rate(member, timetable_rate(sent)),
+            truth,
+            commanded_force_n(sent, len(truth)),
+            error_weight(member, law),
+        )
+        for member, sent, truth in zip(members, frames, truths, strict=True)
+    ]
+    if len(rows) == 1:
+        return rows[0]
+    columns = line_columns(members, law, frames, truths)
+    errors = [row["max_position_error_m"] for row in rows]
+    for train, (row, column) in enumerate(zip(rows, columns, strict=True)):
+        separation = column["separation_m"]
+        row["min_separation_m"] = float(separation.min()) if train else None
+        row["max_separation_m"] = float(separation.max()) if train else None
+        barrier = float(column["barrier_distance_m"].min())
+        row["min_barrier_distance_m"] = None if np.isnan(barrier) else barrier
+        amplified = train > 0 and errors[train - 1] > 0
+        row["string_amplification"] = errors[train] / errors[train - 1] if amplified else None
+    worst = {key: _worst(key, [row[key] for row in rows]) for key in rows[0]}
+    worst["trains"] = [{"train": number, **row} for number, row in enumerate(rows, start=1)]
+    return worst
+
+
+def row_of(members: list[Loaded], law: str, results: list[RunResult]) -> dict[str, Any]:
+    """`run_row` of a run in one process, with a result for each train."""
+    frames, truths = [result.frames for result in results], [result.truth for result in results]
+    return run_row(members, law, frames, truths)
+
+
+def _worst(key: str, values: list[Any]) -> Any:
+    """What stands for the values of all trains."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    if key.startswith(("min_", "first_")) or key == "overspeed_margin_m_s":
+        return min(known)
+    if key == "energy_kwh_per_t":
+        return sum(known) / len(known)
+    return max(known, key=abs)
+
+
+def line_columns(
+    members: list[Loaded], law: str, frames: list[np.ndarray], truths: list[np.ndarray]
+) -> np.ndarray:
+    """By train and tick: `separation_m` from the train ahead, NaN for the leader, and
+    `barrier_distance_m`, k - |e| of the error that the controller reports, NaN for laws without a
+    barrier."""
+    ticks = len(truths[0])
+    columns = np.full(
+        (len(truths), ticks),
+        np.nan,
+        np.dtype([("separation_m", np.float64), ("barrier_distance_m", np.float64)]),
+    )
+    for train, (member, sent, truth) in enumerate(zip(members, frames, truths, strict=True)):
+        if train > 0:
+            columns["separation_m"][train] = truths[train - 1]["position_m"] - truth["position_m"]
+        bound = member.scenario.laws.get(law_label(law), {}).get("k")
+        at, error = decode(sent, ATO_TRACKING, "PositionError")
+        if bound is not None and len(at):
+            error = held_values(at, error, ticks)
+            columns["barrier_distance_m"][train] = bound - np.abs(error)
+    return columns

@@ -1,0 +1,209 @@
+"""SIL: the whole chain in one process, compiled as one loop; MIL: the same loop interpreted on
+checked integers.
+
+Plant and controller exchange the same protected frames as over a bus, tick by tick, and every
+frame is logged.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ato_hil.can_dbc.codec import MESSAGE_COUNT, MESSAGES
+from ato_hil.can_dbc.step import step
+from ato_hil.controller import node as controller_node
+from ato_hil.controller.calibration import Calibration
+from ato_hil.controller.interface import fault_names
+from ato_hil.plant_sim import plant, world
+from ato_hil.plant_sim.scenario import Loaded
+from ato_hil.tools.runs.frames import FRAME
+from ato_hil.tools.runs.result import RunResult
+
+FRAME_IDS = np.array([message.frame_id for message in MESSAGES], np.int32)
+
+
+@step
+def log_mailboxes(mailboxes: Any, tick: Any, frames: Any, count: Any) -> Any:
+    """Appends the fresh mailboxes to `frames` in sending order; returns the new count."""
+    for i in range(MESSAGE_COUNT):
+        if mailboxes[i].fresh != 0:
+            frames[count].tick = tick
+            frames[count].frame_id = FRAME_IDS[i]
+            frames[count].payload = mailboxes[i].payload
+            count += 1
+    return count
+
+
+@step
+def clear(mailboxes: Any) -> None:
+    """All mailboxes stale."""
+    for i in range(MESSAGE_COUNT):
+        mailboxes[i].fresh = 0
+
+
+def build_loop(controller_tick: Any, sense: Any, actuate_and_advance: Any) -> Any:
+    """Loop over `ticks` control periods of the plant and the controllers of all its trains; leaves
+    the number of frames logged of each train in `counts`."""
+
+    @step
+    def loop(
+        ticks: Any,
+        plant_params: Any,
+        limits: Any,
+        track: Any,
+        plant_state: Any,
+        chance: Any,
+        truth: Any,
+        params: Any,
+        profile: Any,
+        state: Any,
+        cells: Any,
+        to_controllers: Any,
+        to_plant: Any,
+        frames: Any,
+        counts: Any,
+    ) -> None:
+        trains = len(plant_state)
+        for train in range(trains):
+            counts[train] = 0
+        for tick in range(ticks):
+            for train in range(trains):
+                clear(to_controllers[train])
+            sense(plant_params, limits, plant_state, chance, tick, to_controllers)
+            for train in range(trains):
+                count = log_mailboxes(to_controllers[train], tick, frames[train], counts[train])
+                clear(to_plant[train])
+                controller_tick(
+                    params[train],
+                    profile,
+                    state[train],
+                    cells[train],
+                    to_controllers[train],
+                    to_plant[train],
+                    1,
+                )
+                counts[train] = log_mailboxes(to_plant[train], tick, frames[train], count)
+            actuate_and_advance(plant_params, track, plant_state, chance, tick, to_plant, truth)
+
+    return loop
+
+
+def run(
+    loaded: Loaded,
+    calibration: Calibration,
+    *,
+    runs: range,
+    seed: int,
+    memory_file: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[tuple[RunResult, controller_node.Controller]]:
+    """The runs of a single train numbered `runs`, one after the other; `progress(run, tick)` is
+    called as they go."""
+    node = controller_node.build(calibration, memory_file)
+    yield from run_controller(loaded, node, runs=runs, seed=seed, progress=progress)
+
+
+def run_controller(
+    loaded: Loaded,
+    node: controller_node.Controller,
+    *,
+    runs: range,
+    seed: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[tuple[RunResult, controller_node.Controller]]:
+    """The same with a controller that the caller has built."""
+    for (result,) in run_line(loaded, [node], runs=runs, seed=seed, progress=progress):
+        yield result, node
+
+
+def run_line(
+    loaded: Loaded,
+    nodes: list[controller_node.Controller],
+    *,
+    runs: range,
+    seed: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[list[RunResult]]:
+    """The runs of all trains, with a controller for each in `nodes`; a result for each."""
+    here = world.build(loaded, seed)
+    params, state, cells = _put_side_by_side(nodes, here)
+    loop = build_loop(nodes[0].tick, here.sense, here.actuate_and_advance)
+    trains = len(nodes)
+    counts = np.zeros(trains, np.int64)
+
+    def drive(ticks: int, chance: Any, truth: Any, frames: Any) -> None:
+        loop(
+            ticks,
+            here.params,
+            here.limits,
+            here.track,
+            here.state,
+            chance,
+            truth,
+            params,
+            nodes[0].profile,
+            state,
+            cells,
+            here.tx,
+            here.rx,
+            frames,
+            counts,
+        )
+
+    # Compiles, or loads what was compiled before.
+    kinds = (plant.CHANCE, plant.TRUTH, FRAME)
+    drive(0, *(world.rows(np.zeros((trains, 0), kind)) for kind in kinds))
+    for number in runs:
+        if progress:
+            progress(number, 0)
+        here.prepare(number)
+        _announce(here, nodes, plant.ARMED, number)
+        here.begin(here.params, here.state)
+        chance = world.chances(here, number)
+        ticks = chance.shape[1]
+        truth = np.zeros((trains, ticks), plant.TRUTH)
+        # As many rows as there could be; the system gives memory to those that are written.
+        frames = np.empty((trains, ticks * MESSAGE_COUNT), FRAME)
+        started = time.perf_counter()
+        drive(ticks, chance, world.rows(truth), world.rows(frames))
+        seconds = time.perf_counter() - started
+        faults = [fault_names(int(node.state[0]["core"]["faults"])) for node in nodes]
+        _announce(here, nodes, plant.ENDED, number)
+        if progress:
+            progress(number, ticks)
+        yield [
+            RunResult(number, frames[train][: counts[train]], truth[train], faults[train], seconds)
+            for train in range(trains)
+        ]
+
+
+def _put_side_by_side(
+    nodes: list[controller_node.Controller], here: world.World
+) -> tuple[Any, Any, Any]:
+    """Params, state and memories of all controllers as arrays; the controllers keep views of their
+    rows, and of the plant's mailboxes, which are the buses."""
+    params = world.rows(np.zeros(len(nodes), nodes[0].params.dtype))
+    state = world.rows(np.zeros(len(nodes), nodes[0].state.dtype))
+    cells = np.stack([node.cells for node in nodes])
+    for train, node in enumerate(nodes):
+        params[train], state[train] = node.params[0], node.state[0]
+        node.params, node.state = params[train : train + 1], state[train : train + 1]
+        node.cells = cells[train]
+        node.rx, node.tx = here.tx[train], here.rx[train]
+    return params, state, cells
+
+
+def _announce(
+    here: world.World, nodes: list[controller_node.Controller], run_state: int, run: int
+) -> None:
+    """RUN_CTRL outside a run, and the controllers' answers."""
+    for train, node in enumerate(nodes):
+        clear(node.rx)
+        clear(node.tx)
+        plant.announce(here.state[train]["node"], run_state, run, node.rx)
+        controller_node.cycle(node, 0)

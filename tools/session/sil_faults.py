@@ -1,0 +1,206 @@
+"""SIL with faults: the compiled steps of plant and controller, with every frame between them
+carried by hand, so that the faults of a plan come between.
+
+The same frames, faults and log as in HIL; some 15 000 ticks a second where the compiled loop of
+`ato_hil.tools.session.sil` has a million.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from ato_hil.can_dbc.codec import FORCE_CMD
+from ato_hil.can_dbc.faults import (
+    CONTROLLER,
+    PLANT,
+    Event,
+    Frame,
+    Plan,
+    Receiver,
+    in_order,
+)
+from ato_hil.can_dbc.inbox import Inbox, fresh_frames
+from ato_hil.controller import node as controller_node
+from ato_hil.controller.interface import fault_names
+from ato_hil.controller.process import inbox_of
+from ato_hil.plant_sim import failures, plant, world
+from ato_hil.plant_sim.process import controller_name, echoes
+from ato_hil.plant_sim.scenario import Loaded
+from ato_hil.tools.runs.frames import FRAME
+from ato_hil.tools.runs.result import RunResult
+
+ANNOUNCEMENTS = 20  # of an end that a controller does not hear
+
+
+@dataclass(frozen=True)
+class Side:
+    """A train's controller, and the ways into its mailboxes and into the plant's."""
+
+    train: int
+    controller: controller_node.Controller
+    to_controller: Inbox
+    to_plant: Inbox
+    plant_mailboxes: np.ndarray
+    plant_node: Any  # state of the plant's node, and its params
+    plant_setting: Any
+
+
+class Watch(Protocol):
+    """Who looks at the receivers, tick by tick."""
+
+    def begin(self, run: int) -> None:
+        """A run begins."""
+
+    def before(self, side: Side, tick: int, sent: list[Frame]) -> None:
+        """The controller's mailboxes are filled; `sent` is what the plant has sent."""
+
+    def controlled(self, side: Side, tick: int, sent: list[Frame], answer: list[Frame]) -> None:
+        """The controller has answered."""
+
+    def applied(self, side: Side, tick: int, answer: list[Frame]) -> None:
+        """The plant has read its mailboxes."""
+
+
+def run_line(
+    loaded: Loaded,
+    nodes: list[controller_node.Controller],
+    *,
+    runs: range,
+    seed: int,
+    plan: Plan,
+    fails: Sequence[failures.AnyFailure] = (),
+    progress: Callable[[int, int], None] | None = None,
+    watch: Watch | None = None,
+) -> Iterator[list[RunResult]]:
+    """As `sil.run_line`, with the faults of `plan`, and with what fails in the plant. A run
+    that a fault cuts short is the last; its results say why."""
+    here = world.build(loaded, seed, fails)
+    events: list[Event] = []
+    sides = [
+        Side(
+            train,
+            node,
+            inbox_of(node, Receiver(plan, CONTROLLER, train, events.append)),
+            Inbox(
+                here.rx[train],
+                here.state["node"]["received"][train],
+                Receiver(
+                    *(plan, PLANT, train, events.append),
+                    failures.planned(fails, train, loaded.scenario.period_s),
+                ),
+            ),
+            here.rx[train],
+            here.state[train]["node"],
+            here.params[train]["node"],
+        )
+        for train, node in enumerate(nodes)
+    ]
+    for number in runs:
+        if progress:
+            progress(number, 0)
+        here.prepare(number)
+        _announce(here, sides, plant.ARMED, number)
+        if watch:
+            watch.begin(number)
+        chance = world.chances(here, number)
+        truth = np.zeros(chance.shape, plant.TRUTH)
+        frames: list[list[tuple[int, int, int]]] = [[] for _ in sides]
+        started = time.perf_counter()
+        cut = _drive(here, sides, number, chance, truth, frames, watch)
+        seconds = time.perf_counter() - started
+        faults = [fault_names(int(node.state[0]["core"]["faults"])) for node in nodes]
+        _announce(here, sides, plant.ENDED, number)
+        ticks = int(here.state[0]["node"]["tick"])
+        if progress:
+            progress(number, ticks)
+        yield [
+            RunResult(
+                number,
+                np.array(frames[train], FRAME),
+                truth[train, :ticks],
+                faults[train],
+                seconds,
+                cut,
+                [event for event in in_order(events) if event.train == train + 1],
+            )
+            for train in range(len(nodes))
+        ]
+        events.clear()
+        if cut:
+            return
+
+
+def _drive(
+    here: world.World,
+    sides: list[Side],
+    run: int,
+    chance: Any,
+    truth: np.ndarray,
+    frames: list[list[tuple[int, int, int]]],
+    watch: Watch | None,
+) -> str:
+    """One run; fills `truth` and `frames`. Why it was cut short, "" if it was not."""
+    here.begin(here.params, here.state)
+    for side in sides:
+        side.to_controller.begin_run(run)
+        side.to_plant.begin_run(run)
+    rows = world.rows(truth)
+    for tick in range(truth.shape[1]):
+        here.sense(here.params, here.limits, here.state, chance, tick, here.tx)
+        answers = []
+        for side in sides:
+            sent = fresh_frames(here.tx[side.train])
+            answer = _control(side, tick, sent, watch)
+            frames[side.train] += [(tick, *frame) for frame in (*sent, *answer)]
+            for frame in answer:
+                side.to_plant.take(*frame)
+            if not any(echoes(tick, *frame) for frame in answer):
+                name = controller_name(here, side.train)
+                return f"{name} is silent: no {FORCE_CMD.name} for tick {tick} of run {run}"
+            side.to_plant.close_tick()
+            answers.append(answer)
+        here.actuate_and_advance(here.params, here.track, here.state, chance, tick, here.rx, rows)
+        if watch:
+            for side, answer in zip(sides, answers, strict=True):
+                watch.applied(side, tick, answer)
+        here.rx["fresh"].fill(0)
+    return ""
+
+
+def _control(side: Side, tick: int, sent: list[Frame], watch: Watch | None) -> list[Frame]:
+    """What a controller answers to the frames of a tick."""
+    node = side.controller
+    for frame in sent:
+        side.to_controller.take(*frame)
+    side.to_controller.close_tick()
+    if watch:
+        watch.before(side, tick, sent)
+    controller_node.cycle(node, 1)
+    answer = fresh_frames(node.tx)
+    if watch:
+        watch.controlled(side, tick, sent, answer)
+    node.rx["fresh"].fill(0)
+    return answer
+
+
+def _announce(here: world.World, sides: list[Side], run_state: int, run: int) -> None:
+    """RUN_CTRL outside a run, until every controller has heard it."""
+    for side in sides:
+        node = side.controller
+        side.to_controller.end_run()
+        side.to_plant.end_run()
+        for _ in range(ANNOUNCEMENTS):
+            plant.announce(here.state[side.train]["node"], run_state, run, here.tx[side.train])
+            for frame in fresh_frames(here.tx[side.train]):
+                side.to_controller.put(*frame)
+            controller_node.cycle(node, 0)
+            node.rx["fresh"].fill(0)
+            node.tx["fresh"].fill(0)
+            if int(node.state[0]["core"]["run_state"]) == run_state:
+                break
+    here.rx["fresh"].fill(0)

@@ -1,0 +1,1 @@
+"""What is seen of a run: the Rerun trace, its blueprints and charts, and the viewer."""

@@ -1,0 +1,373 @@
+"""What a person sees when a trace opens: tabs of plots, every one with its unit.
+
+Overview, learning, bus, signals and events; a line of trains has a tab of its own, and so have
+runs that kept real time. A plot of several runs takes its colours from the ramp, from the first run
+to the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ato_hil.can_dbc.codec import MESSAGES
+from ato_hil.tools.trace.charts import room
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+
+OVERVIEW_LANES = ("mode", "supervision", "guard", "faults", "sensor")
+
+# Shown as bars by run, if the summary has them.
+BARS = (
+    "max_position_error_m",
+    "max_speed_error_m_s",
+    "rms_position_error_m",
+    "rms_speed_error_m_s",
+)
+
+RUNS = "violet is the first run, yellow the last"
+TRAINS = "violet is the leading train, yellow the last"
+
+# Endings of names of quantities, longest first, and their units.
+_UNITS = (
+    ("_kwh_per_t", "kWh/t"),
+    ("_per_s", "1/s"),
+    ("_m_s3", "m/s³"),
+    ("_m_s2", "m/s²"),
+    ("_m_s", "m/s"),
+    ("_us", "µs"),
+    ("_j", "J"),
+    ("_m", "m"),
+    ("_n", "N"),
+    ("_s", "s"),
+)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What there is to show."""
+
+    run: str  # entity of the run that views of one run show
+    current: str  # the train of it that views of one train show
+    car_forces: bool
+    estimates: tuple[str, ...]  # names with unit
+    trains: int
+    own_timetable: bool  # the run shown has a reference of its own
+    length_m: float  # of the reference
+    curves: tuple[str, ...] = ()  # true columns of speeds that supervise the train
+    words: tuple[str, ...] = ()  # of the learning memory, as `charts` names them
+    timing: bool = False
+
+
+def title_of(name: str) -> str:
+    """Name of a quantity as a person reads it: `max_speed_error_m_s` is Max speed error [m/s]."""
+    for ending, unit in _UNITS:
+        if name.endswith(ending):
+            return f"{name.removesuffix(ending).replace('_', ' ').capitalize()} [{unit}]"
+    return name.replace("_", " ").capitalize()
+
+
+def of_session(layout: Layout) -> rrb.Blueprint:
+    """The layout of the trace of one session."""
+    import rerun.blueprint as rrb
+
+    tabs = [_overview(layout), _learning(layout), _bus(layout)]
+    if layout.trains > 1:
+        tabs.insert(0, _line(layout))
+    if layout.timing:
+        tabs.append(_timing(layout))
+    return whole(rrb.Tabs(*tabs, _signals(layout), _events(layout)))
+
+
+def of_several(columns: Sequence[str], numbers: Sequence[str], bars_first: bool) -> rrb.Blueprint:
+    """The layout of a trace of several sessions: their last runs in the same plots, and numbers of
+    the summary by run."""
+    import rerun.blueprint as rrb
+
+    by_run = [
+        rrb.BarChartView(
+            name=f"{title_of(key)} by run",
+            origin=f"/runs/{key}",
+            # One legend is enough, where learning leaves room for it.
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=number == 0),
+        )
+        for number, key in enumerate(numbers)
+    ]
+    rows = [rrb.Horizontal(*by_run[first : first + 3]) for first in range(0, len(by_run), 3)]
+    runs = rrb.Vertical(
+        *rows,
+        rrb.TextDocumentView(name="Sessions", origin="/legend"),
+        row_shares=[3] * len(rows) + [2],
+        name="Errors by run",
+    )
+    over_time = rrb.Vertical(
+        *(plot(title_of(name), f"{name}/**") for name in columns),
+        name="Last runs",
+    )
+    tabs = (runs, over_time) if bars_first else (over_time, runs)
+    return whole(rrb.Tabs(*tabs))
+
+
+def whole(root: rrb.Container) -> rrb.Blueprint:
+    """A blueprint of these views: the plots have the window, and the timeline is `time`."""
+    import rerun.blueprint as rrb
+
+    return rrb.Blueprint(
+        root,
+        rrb.TimePanel(state="collapsed", timeline="time", play_state="paused"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def plot(name: str, *entities: str, legend: bool = True) -> rrb.TimeSeriesView:
+    """A plot over all of the time."""
+    import rerun.blueprint as rrb
+
+    return rrb.TimeSeriesView(
+        name=name,
+        contents=[f"/{entity}" for entity in entities],
+        axis_x=_all_time(),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
+    )
+
+
+def of_all(name: str, entity: str) -> rrb.TimeSeriesView:
+    """The same quantity of several runs, trains or sessions; their colours tell them apart."""
+    return plot(name, f"{entity}/**", legend=False)
+
+
+def chart(name: str, entity: str, length_m: float, below: bool = False) -> rrb.Spatial2DView:
+    """A drawing of `charts` over this distance."""
+    import rerun.blueprint as rrb
+
+    x_range, y_range = room(length_m, below)
+    return rrb.Spatial2DView(
+        name=name,
+        origin=f"/{entity}",
+        background=(13, 13, 13),
+        visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
+    )
+
+
+def bars(key: str) -> rrb.BarChartView:
+    """A number of the summary by run."""
+    import rerun.blueprint as rrb
+
+    return rrb.BarChartView(
+        name=f"{title_of(key)} by run",
+        origin=f"/runs/bars/{key}",
+        plot_legend=rrb.PlotLegend(visible=False),
+    )
+
+
+def lanes(name: str, entity: str, only: Sequence[str] = ()) -> rrb.StateTimelineView:
+    """States over all of the time."""
+    import rerun.blueprint as rrb
+
+    contents = [f"$origin/{lane}" for lane in only] or "$origin/**"
+    return rrb.StateTimelineView(
+        name=name, origin=f"/{entity}", time_view=_all_time(), contents=contents
+    )
+
+
+def _all_time() -> rrb.TimeAxis:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    return rrb.TimeAxis(
+        view_range=rr.TimeRange(
+            start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
+        )
+    )
+
+
+def _beside(views: Iterable[rrb.View]) -> list[rrb.Container]:
+    """The views in a row, or one behind the other where they are many."""
+    import rerun.blueprint as rrb
+
+    found = list(views)
+    if not found:
+        return []
+    return [rrb.Horizontal(*found) if len(found) <= 2 else rrb.Tabs(*found)]
+
+
+def _overview(layout: Layout) -> rrb.Container:
+    import rerun.blueprint as rrb
+
+    current, reference = layout.current, _reference(layout)
+    forces = (
+        plot("Force by car [N]", f"bus/car_force/{current}")
+        if layout.car_forces
+        else plot("Force commanded [N]", f"bus/force/{current}", legend=False)
+    )
+    return rrb.Horizontal(
+        rrb.Vertical(
+            plot(
+                "Speed: measured blue, reference orange, permitted red, target pink [m/s]",
+                f"bus/speed/{current}",
+                f"reference/speed_m_s{reference}",
+                *(f"truth/{field}/{current}" for field in layout.curves),
+                legend=False,
+            ),
+            chart(
+                "Speed over position: true green, reference orange, permitted red [m/s, m]",
+                "over_position/speed",
+                layout.length_m,
+            ),
+            lanes("States and faults", f"bus/state/{current}", OVERVIEW_LANES),
+            row_shares=[5, 6, 6],
+        ),
+        rrb.Vertical(
+            of_all(f"Position error, {_order(layout)} [m]", "truth/position_error_m"),
+            of_all(f"Speed error, {_order(layout)} [m/s]", "truth/speed_error_m_s"),
+            forces,
+        ),
+        name="Overview",
+    )
+
+
+def _reference(layout: Layout) -> str:
+    """Branch of the reference of the run shown."""
+    return f"/{layout.run}" if layout.own_timetable else ""
+
+
+def _order(layout: Layout) -> str:
+    return TRAINS if layout.trains > 1 else RUNS
+
+
+def _learning(layout: Layout) -> rrb.Container:
+    import rerun.blueprint as rrb
+
+    learned = [
+        *_beside(
+            chart(
+                f"Memory by run: {_printed(word)}", f"memory/word_{n}", layout.length_m, below=True
+            )
+            for n, word in enumerate(layout.words)
+        ),
+        *_beside(
+            of_all(f"Estimate {_printed(name)}", f"bus/estimate_{number}")
+            for number, name in enumerate(layout.estimates)
+        ),
+    ]
+    return rrb.Horizontal(
+        rrb.Vertical(
+            rrb.Horizontal(*(bars(key) for key in BARS[:2])),
+            rrb.Horizontal(*(bars(key) for key in BARS[2:])),
+            rrb.TextDocumentView(name="Summary", origin="/runs/table"),
+        ),
+        *([rrb.Vertical(*learned)] if learned else []),
+        name="Learning",
+    )
+
+
+def _printed(name: str) -> str:
+    """The name of a learned quantity with its unit as it is printed."""
+    return name.replace("^2", "²").replace("^3", "³")
+
+
+def _bus(layout: Layout) -> rrb.Container:
+    import rerun.blueprint as rrb
+
+    current = layout.current
+    ages = [plot("Age of the radio data [s]", f"bus/neighbour_age/{current}")]
+    return rrb.Horizontal(
+        rrb.Vertical(
+            plot("Load by message, each second [kbit/s]", f"bus/load/{current}/**"),
+            plot("Longest silence of a message, each second [ms]", f"bus/silence/{current}/**"),
+            *(ages if layout.trains > 1 else ()),
+        ),
+        rrb.Vertical(
+            lanes(
+                "End-to-end check of each frame",
+                f"bus/end_to_end/{current}",
+                [message.name for message in MESSAGES],
+            ),
+            rrb.TextDocumentView(name="Messages of the run", origin="/bus/messages"),
+            row_shares=[3, 2],
+        ),
+        name="Bus",
+    )
+
+
+def _timing(layout: Layout) -> rrb.Container:
+    import rerun.blueprint as rrb
+
+    def row(name: str, field: str) -> rrb.Container:
+        entity = f"timing/{layout.run}"
+        octaves = rrb.BarChartView(
+            name="How often: 0, 1, 2 to 3, 4 to 7 µs, and so on by powers of two",
+            origin=f"/{entity}/octaves/{field}",
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
+        return rrb.Horizontal(plot(f"{name} [µs]", f"{entity}/{field}"), octaves)
+
+    return rrb.Vertical(
+        row("Latency from measurement to command", "latency_us"),
+        row("Lateness of the wake-up", "jitter_us"),
+        row("Time of a step", "step_us"),
+        name="Timing",
+    )
+
+
+def _signals(layout: Layout) -> rrb.Container:
+    import rerun.blueprint as rrb
+
+    current, reference = layout.current, _reference(layout)
+    radio = (
+        plot("Position of the neighbours [m]", f"bus/neighbour_position/{current}"),
+        plot("Speed of the neighbours [m/s]", f"bus/neighbour_speed/{current}"),
+        plot("Timetable against the common one [m]", f"bus/rebased_position/{current}"),
+        plot("Speed of the timetable [m/s]", f"bus/rebased_speed/{current}"),
+    )
+    return rrb.Grid(
+        plot("Position [m]", f"bus/position/{current}", f"reference/position_m{reference}"),
+        plot(
+            "Acceleration [m/s²]",
+            f"bus/acceleration/{current}",
+            f"reference/acceleration_m_s2{reference}",
+            f"truth/acceleration_m_s2/{current}",
+        ),
+        plot("Force [N]", f"bus/force/{current}", f"truth/force_n/{current}"),
+        plot(
+            "Position error [m]",
+            f"bus/position_error/{current}",
+            f"truth/position_error_m/{current}",
+        ),
+        plot("Speed error [m/s]", f"bus/speed_error/{current}", f"truth/speed_error_m_s/{current}"),
+        plot("Distance to the ATP target [m]", f"bus/target_distance/{current}"),
+        *(radio if layout.trains > 1 else ()),
+        grid_columns=3,
+        name="Signals",
+    )
+
+
+def _events(layout: Layout) -> rrb.Container:
+    import rerun.blueprint as rrb
+
+    return rrb.Vertical(
+        lanes("All states", f"bus/state/{layout.current}"),
+        rrb.TextLogView(name="Events", origin="/events"),
+        name="Events",
+    )
+
+
+def _line(layout: Layout) -> rrb.Container:
+    import rerun.blueprint as rrb
+
+    run = layout.run
+    return rrb.Horizontal(
+        of_all(f"Space-time diagram, {TRAINS} [m]", f"truth/position_m/{run}"),
+        rrb.Vertical(
+            of_all("Separation from the train ahead [m]", f"truth/separation_m/{run}"),
+            of_all("Distance to the barrier [m]", f"truth/barrier_distance_m/{run}"),
+            of_all("Position error [m]", f"truth/position_error_m/{run}"),
+            of_all("Speed error [m/s]", f"truth/speed_error_m_s/{run}"),
+        ),
+        name="Line",
+    )
