@@ -88,7 +88,7 @@ figures: $(RUN_READY) ## draw docs/figures again: the papers' figures, from runs
 
 claims: $(RUN_READY) ## measure what the papers claim again, and write it into docs/papers
 	mkdir -p runs/claims
-	for paper in cailc drac mtcc afilc iplc; do
+	for paper in $$(.venv/bin/python -c "from ato_hil.tools import papers; print(*papers.names())"); do
 		.venv/bin/ato-hil claims "$$paper" --json "runs/claims/$$paper.json"
 	done
 	.venv/bin/python -m ato_hil.tools.cli.docs runs/claims/*.json

@@ -9,24 +9,11 @@ from typing import NamedTuple
 import matplotlib
 from matplotlib.figure import Figure
 
+from ato_hil.tools import papers
 from ato_hil.tools.papers import style
-from ato_hil.tools.papers.afilc import figures as afilc
-from ato_hil.tools.papers.cailc import figures as cailc
-from ato_hil.tools.papers.drac import figures as drac
-from ato_hil.tools.papers.iplc import figures as iplc
-from ato_hil.tools.papers.mtcc import figures as mtcc
 from ato_hil.tools.papers.style import Drawing
 from ato_hil.tools.runs.files import write_bytes
 from ato_hil.tools.runs.folder import Folder, FolderError, Missing
-
-# The figures by paper, and the laws that are a scenario's default in that paper.
-PAPERS: dict[str, tuple[tuple[Drawing, ...], tuple[str, ...]]] = {
-    "cailc": (cailc.FIGURES, ("cailc", "ailc", "pdilc", "adaptive", "pid")),
-    "drac": (drac.FIGURES, ("drac", "drac-robust", "drac-exact", "pid-feedforward")),
-    "mtcc": (mtcc.FIGURES, ("mtcc", "mtcc-single", "mtcc-pid")),
-    "afilc": (afilc.FIGURES, ("afilc", "afilc-track")),
-    "iplc": (iplc.FIGURES, ("iplc", "norm-optimal")),
-}
 
 
 class Drawn(NamedTuple):
@@ -45,12 +32,12 @@ class Drawn(NamedTuple):
 
 def paper_of(folder: Folder) -> str:
     """The paper that the scenario of a folder stands for. Raises FolderError."""
-    for paper, (_figures, laws) in PAPERS.items():
-        if folder.scenario.law in laws:
+    for paper in papers.names():
+        if folder.scenario.law in papers.part(paper).LAWS:
             return paper
     raise FolderError(
         f"{folder.path}: scenario {folder.name} with law {folder.scenario.law!r} belongs to none of"
-        f" the papers {', '.join(PAPERS)}"
+        f" the papers {', '.join(papers.names())}"
     )
 
 
@@ -59,18 +46,19 @@ def figures(folders: list[Folder]) -> Iterator[Drawn]:
 
     Raises FolderError if the folders belong to several papers, or a trace cannot be read.
     """
-    papers = [paper_of(folder) for folder in folders]
-    for folder, paper in zip(folders, papers, strict=True):
-        if paper != papers[0]:
+    paper = paper_of(folders[0])
+    for folder in folders[1:]:
+        if paper_of(folder) != paper:
             raise FolderError(
-                f"{folder.path} is of paper {paper}, {folders[0].path} of {papers[0]}"
+                f"{folder.path} is of paper {paper_of(folder)}, {folders[0].path} of {paper}"
             )
-    for drawing in PAPERS[papers[0]][0]:
+    drawings: tuple[Drawing, ...] = papers.part(paper, "figures").FIGURES
+    for drawing in drawings:
         with matplotlib.rc_context(style.SETTINGS):
             try:
-                yield Drawn(papers[0], drawing, drawing.draw(folders))
+                yield Drawn(paper, drawing, drawing.draw(folders))
             except Missing as reason:
-                yield Drawn(papers[0], drawing, None, str(reason))
+                yield Drawn(paper, drawing, None, str(reason))
 
 
 def write(drawn: Drawn, out: Path, formats: Sequence[str]) -> list[Path]:

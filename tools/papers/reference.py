@@ -17,6 +17,7 @@ import numpy as np
 
 from ato_hil.can_dbc.step import step
 from ato_hil.controller.quantise import Vehicle
+from ato_hil.tools import papers
 
 
 def nothing(_gains: Any, _vehicle: Vehicle) -> tuple[float, ...]:
@@ -75,3 +76,12 @@ def q27(value: Any) -> Any:
 def limited(value: Any, low: Any, high: Any) -> Any:
     """`value` in [low, high]."""
     return min(max(value, low), high)
+
+
+def references() -> dict[str, Reference]:
+    """The float64 form of each law that a paper has one for."""
+    return {
+        law: reference
+        for paper in papers.names()
+        for law, reference in papers.part(paper, "reference").REFERENCES.items()
+    }

@@ -23,8 +23,7 @@ from ato_hil.controller.interface import FAULTS_THAT_BLOCK_LEARNING
 from ato_hil.controller.registry import is_file, law_step, load_law
 from ato_hil.plant_sim import world
 from ato_hil.plant_sim.scenario import Loaded, load, members
-from ato_hil.tools.papers.reference import Reference
-from ato_hil.tools.papers.references import REFERENCES
+from ato_hil.tools.papers.reference import Reference, references
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.session import sil
 from ato_hil.tools.verify import (
@@ -71,7 +70,7 @@ def pair_state_dtype(module: ModuleType, reference: Reference, ticks: int) -> np
 
 def check(law: str) -> Iterator[Row]:
     """Rows of force, position and speed for one law."""
-    reference = REFERENCES.get(law)
+    reference = references().get(law)
     if reference is None and is_file(law):
         how = "fixed point against float64"
         yield Row("accuracy", law, how, "there are float64 forms of packaged laws only", ABSENT)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 import shlex
 import subprocess
@@ -13,10 +12,10 @@ import pytest
 import typer
 
 from ato_hil.can_dbc.codec import database
+from ato_hil.tools import papers
 from ato_hil.tools.cli import docs
 from ato_hil.tools.cli.main import app
 from ato_hil.tools.papers.claims import threshold_text
-from ato_hil.tools.papers.draw import PAPERS
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -81,13 +80,13 @@ def test_every_figure_of_every_paper_is_in_the_docs() -> None:
     names = {path.stem for path in (ROOT / "docs" / "figures").iterdir()}
     drawn = {
         f"{paper}-fig{drawing.number}-{drawing.slug}"
-        for paper, (drawings, _laws) in PAPERS.items()
-        for drawing in drawings
+        for paper in papers.names()
+        for drawing in papers.part(paper, "figures").FIGURES
     }
     assert names == drawn, "make figures"
 
 
-@pytest.mark.parametrize("paper", PAPERS)
+@pytest.mark.parametrize("paper", papers.names())
 def test_tables_have_the_claims_of_today_with_their_verdicts(paper: str) -> None:
     page = (ROOT / "docs" / "papers" / f"{paper}.md").read_text(encoding="utf-8")
     table = page.partition(docs.CLAIMS_BEGIN)[2].partition(docs.CLAIMS_END)[0]
@@ -102,7 +101,7 @@ def test_tables_have_the_claims_of_today_with_their_verdicts(paper: str) -> None
             f"{threshold_text(claim)} {claim.unit}".strip(),
             "yes" if claim.expected else "**no**",
         ]
-        for claim in importlib.import_module(f"ato_hil.tools.papers.{paper}.claims").CLAIMS
+        for claim in papers.part(paper, "claims").CLAIMS
     ]
     assert [[*row[:3], row[4]] for row in rows] == expected, "make claims"
 

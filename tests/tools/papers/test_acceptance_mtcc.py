@@ -33,7 +33,7 @@ from ato_hil.tools.papers.mtcc.claims import (
     fault,
     run,
 )
-from ato_hil.tools.papers.references import REFERENCES
+from ato_hil.tools.papers.mtcc.reference import REFERENCES
 from ato_hil.tools.verify.accuracy import differences
 
 SEEDS = range(1, 11)

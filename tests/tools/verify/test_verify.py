@@ -294,7 +294,7 @@ def test_renewal_writes_and_says_what_changed(tmp_path, monkeypatch):
 
 
 def test_a_law_without_a_reference_fails_the_accuracy(monkeypatch):
-    monkeypatch.setattr(accuracy, "REFERENCES", {})
+    monkeypatch.setattr(accuracy, "references", dict)
     (row,) = accuracy.check("cailc")
     assert row.state == FAILED
     assert "no float64 reference" in row.result
