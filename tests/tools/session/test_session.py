@@ -20,7 +20,8 @@ import pytest
 from rerun.chunk import RrdReader
 
 from ato_hil.can_dbc import rendezvous
-from ato_hil.tools.cli.main import Mode, Screen
+from ato_hil.tools.cli.options import Mode
+from ato_hil.tools.cli.run import Screen
 from ato_hil.tools.session import session
 from ato_hil.tools.session.processes import RunError
 from ato_hil.tools.session.replay import prepare, replay

@@ -1,0 +1,184 @@
+"""Buses and recordings: what was on the wire, what it could carry, what works here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from ato_hil.tools.cli.console import EXIT_BAD_INPUT, console, fail, one_line_for_bad_input
+from ato_hil.tools.cli.options import Channel, LawName, Recording, ScenarioName
+
+if TYPE_CHECKING:
+    from ato_hil.tools.reports.bus_report import Report as BusReport
+
+
+def replay(
+    recording: Recording,
+    scenario: Annotated[
+        str | None, typer.Option(help="Scenario; that of FILE.json by default.")
+    ] = None,
+    law: Annotated[
+        str | None, typer.Option(help="Control law; that of FILE.json by default.")
+    ] = None,
+    memory: Annotated[
+        Path | None,
+        typer.Option(help="Learning memory before the first run; only read."),
+    ] = None,
+    channel: Channel = None,
+) -> None:
+    """Feed a recording to the controller alone; say where its commands first differ (exit 1)."""
+    with one_line_for_bad_input():
+        from ato_hil.controller.registry import law_label
+        from ato_hil.tools.session import replay as open_loop
+
+        prepared = open_loop.prepare(recording, scenario, law, memory, channel)
+        console.print(
+            f"{prepared.loaded.name}, {law_label(prepared.calibration.law)}:"
+            f" {len(prepared.runs)} runs",
+            soft_wrap=True,
+        )
+        for note in prepared.notes:
+            console.print(note, style="dim", soft_wrap=True, markup=False)
+        for result in open_loop.replay(prepared):
+            if result.difference is not None:
+                where = f"run {result.run}, tick {result.difference.tick}"
+                raise fail(f"{recording}: {where}: {result.difference.text}", EXIT_BAD_INPUT)
+            console.print(
+                f"run {result.run}: {result.ticks} ticks, {result.commands} commands as recorded"
+            )
+
+
+def decode(
+    recording: Recording,
+    out: Annotated[Path, typer.Option(help="Table to write: X.csv or X.parquet.")],
+    channel: Channel = None,
+) -> None:
+    """Decode a recording to a table: a row for each frame, a column for each signal."""
+    with one_line_for_bad_input():
+        from ato_hil.tools.runs import decode as tables
+
+        done = tables.decode(recording, out, channel)
+    console.print(f"{out}: {done.rows} frames, {len(done.messages)} messages", soft_wrap=True)
+    if done.unknown or done.foreign:
+        console.print(
+            f"left out: {done.unknown} frames that the DBC does not have,"
+            f" {done.foreign} of other kinds or channels",
+            style="dim",
+        )
+
+
+def bus_report(
+    scenario: ScenarioName,
+    law: LawName = None,
+    bitrate: Annotated[
+        int, typer.Option(min=10_000, max=1_000_000, help="Of the wire, bit/s.")
+    ] = 500_000,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, not a table.")] = False,
+) -> None:
+    """Say what a scenario's messages ask of a CAN wire: load and worst-case response times."""
+    import json
+
+    from ato_hil.controller.registry import load_law
+    from ato_hil.plant_sim.scenario import load
+    from ato_hil.tools.reports.bus_report import report
+
+    with one_line_for_bad_input():
+        loaded = load(scenario)
+        name = law or loaded.scenario.law
+        load_law(name)
+        with console.status("finding out what is sent ..."):
+            found = report(loaded, name, bitrate)
+    if as_json:
+        typer.echo(json.dumps(found.as_json(), indent=1))
+    else:
+        _print_bus_report(found)
+    if found.complaints:
+        raise fail(f"{bitrate} bit/s: {'; '.join(found.complaints)}", EXIT_BAD_INPUT)
+
+
+def _print_bus_report(found: BusReport) -> None:
+    headings = ("id", "message", "bytes", "frames\na tick", "cycle\nms", "frame\nbits", "load\n%")
+    table = Table(*headings, "response\nms", "deadline\nms", "margin\nms", header_style="bold")
+    for column in table.columns:
+        column.justify = "right"
+    table.columns[1].justify = "left"
+    for row in found.rows:
+        table.add_row(
+            f"{row.frame_id:#05x}",
+            row.message,
+            f"{row.data_bytes}",
+            f"{row.frames_per_tick:.2f}",
+            f"{row.cycle_ms:g}",
+            f"{row.frame_bits}",
+            f"{100 * row.load:.2f}",
+            "no bound" if row.response_ms is None else f"{row.response_ms:.3f}",
+            f"{row.cycle_ms:g}",
+            "-" if row.margin_ms is None else f"{row.margin_ms:.3f}",
+            style=None if row.meets_deadline else "red",
+        )
+    table.add_section()
+    load = f"{100 * found.load:.2f}"
+    table.add_row("", "all", "", f"{found.frames_per_tick:.2f}", "", "", load, "", "", "")
+    console.print(table)
+
+
+def bench(
+    bus: Annotated[
+        list[str] | None,
+        typer.Option(help="Bus to measure, may be repeated; the first is that of the HIL figure."),
+    ] = None,
+    sessions: Annotated[bool, typer.Option(help="Measure SIL and HIL too.")] = True,
+) -> None:
+    """Measure SIL, HIL and buses as ratios to a peer in the same run."""
+    from ato_hil.tools.bench import bench as rates
+    from ato_hil.tools.bench import pingpong
+
+    buses = bus or ["hub:bench"]
+    with one_line_for_bad_input():
+        if sessions:
+            table = Table("what", "ticks/s", "peer", "peer's ticks/s", "ratio", header_style="bold")
+            for figure in rates.measure(buses[0]):
+                table.add_row(
+                    figure.what,
+                    f"{figure.ticks_per_s:,.0f}",
+                    figure.peer,
+                    f"{figure.peer_ticks_per_s:,.0f}",
+                    f"{figure.ratio:.2f}",
+                )
+            console.print(table)
+        table = Table(
+            *("ping-pong", "round trip p50 µs", "p99 µs", "frames/s"),
+            *("p50 : C", "p99 : C", "frames/s : C"),
+            header_style="bold",
+        )
+        for name in buses:
+            figures = pingpong.measure(name)
+            for pair in figures:
+                table.add_row(*_ping_pong(pair, figures[0]))
+        console.print(table)
+
+
+def _ping_pong(figure: Any, peer: Any) -> list[str]:
+    cells = (figure.median_us, figure.slowest_us, figure.frames_per_s)
+    row = [figure.what, *(f"{cell:,.0f}" for cell in cells)]
+    if peer.what.startswith("C"):
+        peers = (peer.median_us, peer.slowest_us, peer.frames_per_s)
+        row += [f"{mine / its:.2f}" for mine, its in zip(cells, peers, strict=True)]
+    return row
+
+
+def doctor() -> None:
+    """Say what works on this machine, and what to do about what does not."""
+    from ato_hil.tools.cli import doctor as checks
+
+    findings = checks.examine()
+    table = Table("what", "state", "how it was checked, and what to do", header_style="bold")
+    for finding in findings:
+        colour = {"works": "green", "absent": "yellow", "broken": "red"}[finding.state]
+        table.add_row(finding.what, f"[{colour}]{finding.state}[/]", finding.text)
+    console.print(table)
+    if any(finding.state == "broken" for finding in findings):
+        raise typer.Exit(EXIT_BAD_INPUT)

@@ -1,0 +1,50 @@
+"""The one console: how the command line prints, fails and ends."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import typer
+from rich.console import Console
+
+from ato_hil.can_dbc.errors import InputError
+
+# Where there is no terminal, tables are for files and pipes: wide enough not to wrap.
+console = Console(highlight=False, width=None if sys.stdout.isatty() else 150)
+errors = Console(stderr=True, highlight=False)
+
+EXIT_BAD_INPUT = 1
+EXIT_ENDED_EARLY = 3
+EXIT_INTERRUPTED = 130
+
+
+def fail(message: str, code: int) -> typer.Exit:
+    """Says why on one line; what it returns, raised, ends the command with that exit status."""
+    errors.print(f"ato-hil: {message}", style="red", soft_wrap=True, markup=False)
+    return typer.Exit(code)
+
+
+@contextmanager
+def one_line_for_bad_input() -> Iterator[None]:
+    """Bad input of every kind is one line and an exit status, no traceback."""
+    try:
+        yield
+    except InputError as error:
+        raise fail(str(error), EXIT_BAD_INPUT) from None
+
+
+@contextmanager
+def sigterm_as_ctrl_c() -> Iterator[None]:
+    """What SIGTERM ends, ends as with Ctrl-C: with what it has."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,153 @@
+"""Look: scenarios before a run, what it left after it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from ato_hil.tools.cli.console import (
+    EXIT_BAD_INPUT,
+    console,
+    fail,
+    one_line_for_bad_input,
+    sigterm_as_ctrl_c,
+)
+from ato_hil.tools.cli.options import Picture, ScenarioName
+
+
+def list_scenarios() -> None:
+    """List the scenarios and the laws that each has gains for."""
+    from ato_hil.plant_sim.scenario import ScenarioError, case_names, load
+
+    table = Table("scenario", "laws (default first)", "run", "what it is", header_style="bold")
+    try:
+        for name in case_names():
+            loaded = load(name)
+            default = loaded.scenario.law
+            others = sorted(set(loaded.scenario.laws) - {default})
+            duration_s = loaded.ticks * loaded.scenario.period_s
+            length = f"{loaded.profile.position_m[-1]:.0f} m, {duration_s:.0f} s"
+            table.add_row(name, " ".join([default, *others]), length, loaded.scenario.title)
+    except ScenarioError as error:
+        raise fail(str(error), EXIT_BAD_INPUT) from None
+    console.print(table)
+
+
+def profile(
+    scenario: ScenarioName,
+    run: Annotated[
+        int, typer.Option(min=0, help="Run whose timetable to print; 0: as planned.")
+    ] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of that run.")] = 1,
+) -> None:
+    """Print the reference profile and the limit of each control period as CSV, for nodes of your
+    own."""
+    from ato_hil.plant_sim.scenario import at_rate, load
+    from ato_hil.plant_sim.world import ceiling_of, timetable_rate
+
+    with one_line_for_bad_input():
+        loaded = load(scenario)
+    if run:
+        loaded = at_rate(loaded, timetable_rate(loaded, seed, run))
+    reference = loaded.profile
+    columns = {
+        "position_m": reference.position_m,
+        "speed_m_s": reference.speed_m_s,
+        "acceleration_m_s2": reference.acceleration_m_s2,
+        "permitted_speed_m_s": ceiling_of(loaded),
+    }
+    lines = [",".join(["tick", *columns])]
+    for tick, row in enumerate(zip(*columns.values(), strict=True)):
+        lines.append(",".join([f"{tick}", *(f"{value:.7f}" for value in row)]))
+    typer.echo("\n".join(lines))
+
+
+def view(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="What `ato-hil run` wrote; several are overlaid."),
+    ],
+    law_compare: Annotated[
+        bool, typer.Option("--law-compare", help="Errors by run first, side by side.")
+    ] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve it to a browser of this machine.")
+    ] = False,
+    screenshot: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.png", help="Write a picture instead; needs no screen."),
+    ] = None,
+    tab: Annotated[
+        str | None, typer.Option(help="Of the picture, such as Learning; the first by default.")
+    ] = None,
+) -> None:
+    """Show finished runs in the viewer."""
+    from ato_hil.tools.trace import live_viewer
+    from ato_hil.tools.trace import viewer as finished
+
+    with one_line_for_bad_input(), sigterm_as_ctrl_c():
+        recorded = finished.load(folders)
+        with finished.prepared(recorded, law_compare) as trace:
+            if screenshot is not None:
+                finished.screenshot(trace, screenshot, tab)
+                console.print(f"picture {screenshot}", soft_wrap=True)
+                return
+            kind = live_viewer.WEB if web else live_viewer.NATIVE
+            live_viewer.check(kind)
+            process, text = live_viewer.show(kind, [str(trace.resolve())])
+            console.print(text, soft_wrap=True)
+            try:
+                status = process.wait()
+            except KeyboardInterrupt:
+                live_viewer.end(process)
+            else:
+                if status:
+                    raise fail(f"the viewer ended with exit status {status}", EXIT_BAD_INPUT)
+
+
+def figures(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Folders of `ato-hil run`, all of one paper."),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the pictures; DIR/figures by default.")
+    ] = None,
+    formats: Annotated[
+        list[Picture] | None,
+        typer.Option("--format", help="May be given several times; png and svg by default."),
+    ] = None,
+) -> None:
+    """Draw a paper's figures from runs, with what the paper states."""
+    from ato_hil.tools.papers import draw
+    from ato_hil.tools.runs.folder import read
+
+    kinds = [kind.value for kind in formats or (Picture.png, Picture.svg)]
+    target = out or folders[0] / "figures"
+    files = []
+    with one_line_for_bad_input():
+        for drawn in draw.figures([read(folder) for folder in folders]):
+            if drawn.figure is None:
+                console.print(f"{drawn.stem}: not drawn: {drawn.why_not}", soft_wrap=True)
+                continue
+            files += draw.write(drawn, target, kinds)
+            console.print(f"{drawn.stem}: {drawn.drawing.caption}", soft_wrap=True)
+    if not files:
+        raise fail("nothing could be drawn", EXIT_BAD_INPUT)
+    console.print(f"{len(files)} files in {target}", soft_wrap=True)
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of `ato-hil run`.")],
+    out: Annotated[Path | None, typer.Option(help="HTML file; DIR/report.html by default.")] = None,
+) -> None:
+    """Write one HTML page of a run: configuration, tables, figures, digests, versions."""
+    from ato_hil.tools.reports import report as page
+
+    target = out or folder / "report.html"
+    with one_line_for_bad_input():
+        page.write(folder, target)
+    console.print(f"report  {target}", soft_wrap=True)

@@ -1,0 +1,58 @@
+"""The choices of the options, and the parameters that several commands have."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class Mode(StrEnum):
+    """Where the controller runs."""
+
+    hil = "hil"
+    sil = "sil"
+    mil = "mil"
+
+
+class External(StrEnum):
+    """A node that is not ours."""
+
+    controller = "controller"
+    plant = "plant"
+
+
+class Viewer(StrEnum):
+    """Where the trace is shown."""
+
+    native = "native"
+    web = "web"
+
+
+class Pace(StrEnum):
+    """Who keeps the time."""
+
+    lockstep = "lockstep"
+    realtime = "realtime"
+
+
+class Picture(StrEnum):
+    """How a figure is stored."""
+
+    png = "png"
+    svg = "svg"
+    pdf = "pdf"
+
+
+ScenarioName = Annotated[
+    str, typer.Argument(metavar="SCENARIO", help="Name of a scenario or a .toml file.")
+]
+LawName = Annotated[str | None, typer.Option(help="Control law; the scenario's by default.")]
+Runs = Annotated[int | None, typer.Option(min=1, help="Runs in a row; the scenario's by default.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of noise and disturbance.")]
+Recording = Annotated[
+    Path, typer.Argument(metavar="FILE", help="Recording: .blf, .asc, .log (candump -L), .mf4.")
+]
+Channel = Annotated[str | None, typer.Option(help="The channel, if several carry our frames.")]

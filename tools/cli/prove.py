@@ -1,0 +1,282 @@
+"""Prove: claims of the papers, promises of the firmware, and what faults come to."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from ato_hil.tools.cli.console import (
+    EXIT_BAD_INPUT,
+    EXIT_ENDED_EARLY,
+    EXIT_INTERRUPTED,
+    console,
+    fail,
+    one_line_for_bad_input,
+    sigterm_as_ctrl_c,
+)
+from ato_hil.tools.cli.options import Mode
+
+if TYPE_CHECKING:
+    from ato_hil.tools.campaigns.threats import Campaign
+    from ato_hil.tools.campaigns.undetected import Rate
+    from ato_hil.tools.verify import Row
+
+RESIDUAL_FRAMES = 10_000_000  # random corruptions, for the rate of those that are not seen
+
+
+def claims(
+    paper: Annotated[str, typer.Argument(help="Of which law: cailc, drac, mtcc, afilc, iplc.")],
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the rows to this file as well.")
+    ] = None,
+) -> None:
+    """Measure a paper's claims through the product, row by row."""
+    from ato_hil.tools import papers
+    from ato_hil.tools.papers.claims import evaluate
+    from ato_hil.tools.runs import files
+
+    known = papers.names()
+    if paper not in known:
+        raise fail(f"no claims of {paper!r}, expected one of {', '.join(known)}", EXIT_BAD_INPUT)
+    if json_file is not None and not json_file.absolute().parent.is_dir():
+        raise fail(f"{json_file}: no such folder", EXIT_BAD_INPUT)
+    table = Table("claim", "paper", "threshold", "measured", "holds", header_style="bold")
+    rows = []
+    for claim in papers.part(paper, "claims").CLAIMS:
+        row = evaluate(claim)
+        rows.append(row)
+        colour = "green" if row.holds == row.expected else "red"
+        verdict = ("yes" if row.holds else "no") + ("" if row.expected else " (as found)")
+        table.add_row(
+            row.text,
+            row.paper,
+            f"{row.threshold} {row.unit}".strip(),
+            f"{row.measured:.4g} {row.unit}".strip(),
+            f"[{colour}]{verdict}[/]",
+        )
+    console.print(table)
+    if json_file is not None:
+        content = {"schema": 1, "paper": paper, "claims": [row.as_json() for row in rows]}
+        files.write_json(json_file, content)
+    surprises = [row.text for row in rows if row.holds != row.expected]
+    if surprises:
+        raise fail(f"otherwise than found before: {'; '.join(surprises)}", EXIT_BAD_INPUT)
+
+
+def verify(
+    laws: Annotated[list[str] | None, typer.Argument(help="Laws; all by default.")] = None,
+    fast: Annotated[bool, typer.Option("--fast", help="Only what takes seconds.")] = False,
+    renew_golden: Annotated[
+        bool, typer.Option("--renew-golden", help="Write new golden digests and say what changed.")
+    ] = False,
+) -> None:
+    """Check every promise of the firmware: integers, no overflow, same bits, accuracy, time."""
+    from ato_hil.controller.registry import law_names
+    from ato_hil.tools.verify import identity, table
+
+    rows = []
+    with one_line_for_bad_input():
+        if renew_golden:
+            for line in identity.renew(laws or law_names()):
+                console.print(line, soft_wrap=True, markup=False)
+            return
+        with console.status("verifying") as status:
+            for row in table.run(laws or [], fast):
+                rows.append(row)
+                if not console.is_terminal:
+                    line = f"{row.state}: {row.name}, {row.subject}; {row.how}: {row.result}"
+                    console.print(line, soft_wrap=True, markup=False)
+                status.update(f"{len(rows)} checks; last: {row.name}, {row.subject}")
+    if console.is_terminal:
+        _print_rows(rows)
+    if rows[-1].state == "failed":
+        last = rows[-1]
+        raise fail(f"{last.name} of {last.subject} failed: {last.result}", EXIT_BAD_INPUT)
+
+
+def _print_rows(rows: list[Row]) -> None:
+    shown = Table("property", "of", "how it was checked", "result", "", header_style="bold")
+    for row in rows:
+        colour = {"passed": "green", "absent": "yellow", "failed": "red"}[row.state]
+        cells = (escape(cell) for cell in (row.name, row.subject, row.how, row.result))
+        shown.add_row(*cells, f"[{colour}]{row.state}[/]")
+    console.print(shown)
+
+
+def threats(
+    frames: Annotated[
+        int | None,
+        typer.Option(min=1, help="At least so many; a million in SIL, a hundred thousand in HIL."),
+    ] = None,
+    mode: Annotated[Mode, typer.Option(help="sil, or hil: over a bus as well.")] = Mode.sil,
+    bus: Annotated[str, typer.Option(help="Of mode hil, as for `run`.")] = "auto",
+    seed: Annotated[int, typer.Option(min=0, help="Of the faults.")] = 1,
+    out: Annotated[
+        Path, typer.Option(help="Folder of threats.json, its scenario and its faults.")
+    ] = Path("runs/threats"),
+) -> None:
+    """Attack a run with every threat of EN 50159, and say what was noticed, how soon, and what
+    came of it."""
+    from ato_hil.tools.campaigns import threats as campaign
+    from ato_hil.tools.campaigns import undetected
+    from ato_hil.tools.session.processes import RunError
+
+    if mode is Mode.mil:
+        raise fail("threats: mode is mil, expected sil or hil", EXIT_BAD_INPUT)
+    least = frames or (1_000_000 if mode is Mode.sil else 100_000)
+    try:
+        with (
+            one_line_for_bad_input(),
+            sigterm_as_ctrl_c(),
+            console.status("compiling ...") as status,
+        ):
+            rates = undetected.measure(RESIDUAL_FRAMES, seed)
+            found = campaign.run(least, mode.value, bus, seed, out, status.update)
+    except RunError as error:
+        raise fail(str(error), EXIT_ENDED_EARLY) from None
+    except KeyboardInterrupt:
+        raise fail("interrupted", EXIT_INTERRUPTED) from None
+    _print_threats(found)
+    _print_residual(rates)
+    problems = found.problems + [f"{r.corruption}: not as computed" for r in rates if not r.agrees]
+    if problems:
+        raise fail("; ".join(problems), EXIT_BAD_INPUT)
+
+
+def _print_threats(found: Campaign) -> None:
+    headings = ("injected", "noticed", "not, no\neffect", "not, force\nchanged")
+    reaction = ("reaction\np50", "ticks\nmax", "bound", "to the EBI\nm/s")
+    table = Table("threat", "runs", "frames", *headings, *reaction, header_style="bold")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for row in found.rows:
+        table.add_row(
+            row.threat,
+            *(f"{n:,}" for n in (row.runs, row.frames, row.injected, row.noticed)),
+            *(f"{n:,}" for n in (row.harmless, row.with_effect)),
+            *("-" if n is None else f"{n:g}" for n in (row.reaction_p50, row.reaction_max)),
+            "none" if row.bound is None else f"{row.bound}",
+            f"{row.margin_m_s:.2f}",
+            style="red" if row.problems else None,
+        )
+    console.print(table)
+    text = f"{found.frames:,} frames, {found.mode}, seed {found.seed}, digest {found.digest}"
+    console.print(text, soft_wrap=True)
+
+
+def _print_residual(rates: list[Rate]) -> None:
+    table = Table("corruption", "frames", "taken for good", "share", header_style="bold")
+    table.add_column("computed")
+    table.add_column("99.99 % interval")
+    for rate in rates:
+        exact = rate.low == rate.high
+        table.add_row(
+            rate.corruption,
+            f"{rate.frames:,}",
+            f"{rate.passed:,}",
+            f"{rate.passed / rate.frames:.3g}",
+            "all tried" if exact else f"{rate.computed:.4g}",
+            "-" if exact else f"{rate.low:.4g} .. {rate.high:.4g}",
+            style=None if rate.agrees else "red",
+        )
+    console.print(table)
+
+
+def noise(
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario or a .toml file; of one train.")
+    ] = "subway",
+    law: Annotated[str, typer.Option(help="One that does not learn.")] = "pid",
+    frames: Annotated[int, typer.Option(min=1, help="Random frames to send.")] = 1_000_000,
+    words: Annotated[
+        int, typer.Option(min=1, help="Random words into mailboxes, without a bus.")
+    ] = 10_000_000,
+    bus: Annotated[str, typer.Option(help="As for `run`.")] = "auto",
+    seed: Annotated[int, typer.Option(min=0, help="Of noise and scenario.")] = 1,
+) -> None:
+    """Send random frames beside a run (HIL), and say whether a force changed; then put random words
+    into the mailboxes of firmware and plant."""
+    from ato_hil.tools.campaigns import random_frames as flood
+    from ato_hil.tools.campaigns import random_mailboxes
+    from ato_hil.tools.session.processes import RunError
+
+    try:
+        with (
+            one_line_for_bad_input(),
+            sigterm_as_ctrl_c(),
+            console.status("compiling ...") as status,
+        ):
+            found = flood.beside(scenario, law, frames, seed, bus, status.update)
+            status.update("random words ...")
+            direct = random_mailboxes.run(scenario, words, seed)
+    except RunError as error:
+        raise fail(str(error), EXIT_ENDED_EARLY) from None
+    except KeyboardInterrupt:
+        raise fail("interrupted", EXIT_INTERRUPTED) from None
+    kinds = ", ".join(f"{count:,} {kind}" for kind, count in found.kinds.items())
+    console.print(f"random frames sent   {found.frames:,} ({kinds})", soft_wrap=True)
+    console.print(f"beside               {found.runs} runs, {found.ticks:,} ticks")
+    console.print(f"ticks changed        {found.changed}")
+    console.print(f"runs with a fault    {found.stopped} ({', '.join(found.faults) or 'none'})")
+    console.print(f"expected to be taken {found.expected_taken:.2g} frames")
+    console.print(f"random words         {direct.words:,}, half of them protected")
+    console.print(f"largest force        {direct.largest_command:.3f} commanded,", end=" ")
+    console.print(f"{direct.largest_traction:.3f} of traction, of what the train can give")
+    problems = []
+    if found.frames < frames:
+        problems.append(f"{found.frames} random frames were sent, expected {frames}")
+    if found.changed:
+        problems.append(f"{found.changed} ticks are not as without noise")
+    if max(direct.largest_command, direct.largest_traction) > 1:
+        problems.append("a force is larger than the train can give")
+    if problems:
+        raise fail("; ".join(problems), EXIT_BAD_INPUT)
+
+
+def endurance(
+    times: Annotated[int, typer.Option(min=1, help="Sessions.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of victims and moments.")] = 1,
+    out: Annotated[
+        Path, typer.Option(help="Folder of endurance.json, and of the trials that failed.")
+    ] = Path("runs/endurance"),
+) -> None:
+    """Kill and stop nodes of sessions at random moments: each has to end named and clean."""
+    from ato_hil.tools.campaigns import endurance as trials
+    from ato_hil.tools.runs import files
+
+    done = []
+    with (
+        one_line_for_bad_input(),
+        sigterm_as_ctrl_c(),
+        console.status("") as status,
+        suppress(KeyboardInterrupt),  # what was done counts
+    ):
+        for outcome in trials.campaign(trials.plan(times, seed), out):
+            done.append(outcome)
+            status.update(f"{len(done)} of {times} sessions; last: {outcome.cause}")
+            for complaint in outcome.complaints:
+                text = f"trial {outcome.trial.number}: {complaint} ({outcome.cause})"
+                console.print(text, style="red", soft_wrap=True, markup=False)
+            rows = [each.as_json() for each in done]
+            files.write_json(out / "endurance.json", {"schema": 1, "seed": seed, "trials": rows})
+    headings = ("node", "signal", "sessions", "named and clean", "longest to the end, s")
+    table = Table(*headings, header_style="bold")
+    kinds = dict.fromkeys((each.trial.victim, each.trial.signal) for each in done)
+    for victim, number in kinds:
+        of_kind = [
+            each for each in done if (each.trial.victim, each.trial.signal) == (victim, number)
+        ]
+        clean = sum(not each.complaints for each in of_kind)
+        longest = max(each.seconds for each in of_kind)
+        table.add_row(victim, number.name, f"{len(of_kind)}", f"{clean}", f"{longest:.1f}")
+    console.print(table)
+    failed = sum(bool(each.complaints) for each in done)
+    if failed:
+        raise fail(f"{failed} of {len(done)} sessions did not end as demanded", EXIT_BAD_INPUT)
+    if len(done) < times:
+        raise fail(f"interrupted after {len(done)} of {times} sessions", EXIT_INTERRUPTED)
