@@ -80,7 +80,7 @@ def check(law: str) -> Iterator[Row]:
             "accuracy",
             law,
             "fixed point against float64",
-            "no float64 reference in references/",
+            "no float64 form in REFERENCES of a paper",
             FAILED,
         )
         return
