@@ -21,6 +21,7 @@ MAY_IMPORT = {
 ROOMS = (
     {"runs"},
     {"trace"},
+    {"export"},
     {"session"},
     {"campaigns", "papers"},
     {"verify", "reports", "bench"},

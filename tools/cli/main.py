@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from ato_hil.tools.cli import buses, compare, look, prove, run
+from ato_hil.tools.cli import buses, compare, export, look, prove, run
 from ato_hil.tools.cli.options import Viewer
 
 app = typer.Typer(
@@ -34,6 +34,7 @@ app.command()(prove.threats)
 app.command()(prove.noise)
 app.command()(prove.verify)
 app.command()(prove.endurance)
+app.add_typer(export.app, name="export")
 
 
 def main() -> None:

@@ -75,7 +75,7 @@ class Firmware:
         return max(int(grid["cells"]), 1), max(int(grid["words"]), 1)
 
 
-class Program99:
+class Translated:
     """The translated firmware."""
 
     def __init__(self, made: Firmware) -> None:
@@ -141,7 +141,7 @@ def top(made: Firmware, text: str) -> list[str]:
     return ["/* " + lines[0], *(f" * {line}".rstrip() for line in lines[1:]), " */"]
 
 
-def source_file(made: Program99) -> str:
+def source_file(made: Translated) -> str:
     """ato.c."""
     program = made.program
     functions = [f for module in program.modules for f in in_order(program, module)]
@@ -311,7 +311,7 @@ def information(made: Firmware) -> str:
     )
 
 
-def header_file(made: Program99) -> str:
+def header_file(made: Translated) -> str:
     """ato.h, the manual."""
     fw = made.firmware
     law = fw.law
@@ -433,7 +433,7 @@ as long as parameters and state are what ato_config.c and these functions made t
 Formats: Qn is an integer in units of 2^-n. x -> y of a range is inclusive."""
 
 
-def config_file(made: Program99) -> str:
+def config_file(made: Translated) -> str:
     """ato_config.c."""
     fw = made.firmware
     lines = [
@@ -509,4 +509,12 @@ def text_of(lines: list[str]) -> str:
     return "\n".join(line.rstrip() for line in lines).rstrip() + "\n"
 
 
-__all__ = ["Firmware", "Program99", "can_file", "cmake_file", "config_file", "header_file", "codec"]
+__all__ = [
+    "Firmware",
+    "Translated",
+    "can_file",
+    "cmake_file",
+    "config_file",
+    "header_file",
+    "codec",
+]

@@ -1,0 +1,39 @@
+"""`ato-hil export`: the firmware for other tools and targets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ato_hil.tools.cli.console import one_line_for_bad_input
+
+app = typer.Typer(help="The firmware for other tools and targets.", no_args_is_help=True)
+
+
+@app.callback()
+def group() -> None:
+    """The firmware for other tools and targets."""
+
+
+@app.command("c")
+def c_command(
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario (`ato-hil list`) or a .toml file.")
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Folder to write; an export that is there is replaced.")
+    ],
+    law: Annotated[
+        str | None, typer.Option(help="Control law, or its .py file; the scenario's by default.")
+    ] = None,
+) -> None:
+    """The cyclic task with its law as C99: header, sources, self-test, CMakeLists.txt."""
+    with one_line_for_bad_input():
+        from ato_hil.tools.export import folder
+
+        made = folder.files(scenario, law)
+        folder.write(made, out)
+    lines = sum(text.count("\n") for text in made.values())
+    typer.echo(f"{out}: {len(made)} files, {lines} lines; the manual is {out / 'ato.h'}")
