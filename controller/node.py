@@ -14,7 +14,7 @@ import numpy as np
 
 from ato_hil.can_dbc.codec import mailboxes
 from ato_hil.can_dbc.step import INTERPRETED, step
-from ato_hil.controller import memory, store
+from ato_hil.controller import library, memory, store
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.firmware import build_tick, state_dtype
 from ato_hil.controller.interface import (
@@ -70,10 +70,14 @@ def callable_tick(tick: Any) -> Any:
     return call
 
 
-def build(calibration: Calibration, memory_file: Path | None = None) -> Controller:
-    """A controller; its learning memory comes from `memory_file` if that exists.
+def build(
+    calibration: Calibration, memory_file: Path | None = None, firmware: Path | None = None
+) -> Controller:
+    """A controller; its learning memory comes from `memory_file` if that exists, its tick from the
+    library `firmware`, if one is given.
 
-    Raises store.MemoryFileError if the file is foreign or damaged.
+    Raises store.MemoryFileError if the memory file is foreign or damaged, LibraryError if the
+    library is.
     """
     module = load_law(calibration.law)
     state = np.zeros(1, state_dtype(module.STATE))
@@ -83,7 +87,10 @@ def build(calibration: Calibration, memory_file: Path | None = None) -> Controll
     )
     if memory_file is not None and memory_file.exists():
         cells[0] = store.load(memory_file, calibration).cells
-    tick = build_tick(law_step(module))
+    if firmware is None:
+        tick = build_tick(law_step(module))
+    else:
+        tick = library.load(firmware, calibration)
     return Controller(
         calibration=calibration,
         tick=tick,

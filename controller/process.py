@@ -37,6 +37,7 @@ from ato_hil.can_dbc.faults import CONTROLLER, Receiver, receiver
 from ato_hil.can_dbc.inbox import Inbox, fresh_frames, intact
 from ato_hil.controller import calibration, node, store
 from ato_hil.controller.interface import ARMED, ENDED, RUNNING
+from ato_hil.controller.library import LibraryError
 from ato_hil.controller.quantise import CalibrationError
 from ato_hil.controller.registry import LawError
 
@@ -233,6 +234,7 @@ def main() -> int:
     parser.add_argument("--calibration", type=Path, required=True)
     parser.add_argument("--bus", required=True)
     parser.add_argument("--memory", type=Path)
+    parser.add_argument("--firmware", type=Path, metavar="LIB.so", help="in place of our own")
     parser.add_argument("--faults", type=Path, metavar="DIR", help="with the plan and the logs")
     parser.add_argument("--train", type=int, default=0, help="of a line, 0 leads")
     parser.add_argument("--realtime", type=Path, metavar="DIR", help="by the clock; for its timing")
@@ -242,13 +244,21 @@ def main() -> int:
     stop = Stop()
     follow_parent()
     try:
-        controller = node.build(calibration.load(arguments.calibration), arguments.memory)
+        controller = node.build(
+            calibration.load(arguments.calibration), arguments.memory, arguments.firmware
+        )
         node.cycle(controller, 0)  # compiles, or loads what was compiled before
         intact(TRAIN_POSITION, 0)
         controller.tx["fresh"].fill(0)
         inbox = inbox_of(controller, receiver(arguments.faults, CONTROLLER, arguments.train))
         bus = open_bus(arguments.bus)
-    except (CalibrationError, LawError, store.MemoryFileError, BusError) as error:
+    except (
+        CalibrationError,
+        LawError,
+        LibraryError,
+        store.MemoryFileError,
+        BusError,
+    ) as error:
         tell("error", message=str(error))
         return 1
     refused = [] if arguments.realtime is None else pace.prepare()

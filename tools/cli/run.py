@@ -160,6 +160,10 @@ def run(
         Path | None,
         typer.Option(help="Faults to inject, a .toml file: see docs/faults.md."),
     ] = None,
+    firmware: Annotated[
+        Path | None,
+        typer.Option(help="Library of `ato-hil export c` in place of the compiled Python."),
+    ] = None,
     view: Annotated[
         Viewer | None,
         typer.Option(
@@ -200,6 +204,7 @@ def run(
                 pace=pace.value,
                 spin_us=spin_us,
                 viewer=viewer,
+                firmware=firmware,
             ),
             Screen(mode),
         )

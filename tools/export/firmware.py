@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import inspect
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -326,6 +327,7 @@ def header_file(made: Translated) -> str:
         functions=len(made.program.used),
         period_ms=period_ms(fw),
     )
+    text = reflowed(text)
     law_text = f"The law, {source_of(law).file}:\n\n{inspect.getdoc(law) or ''}"
     bounds = getattr(law, "STATE_BOUNDS", {})
     lines = [
@@ -399,6 +401,13 @@ def header_file(made: Translated) -> str:
         "#endif",
     ]
     return text_of(lines)
+
+
+def reflowed(text: str) -> str:
+    """Paragraphs that are not indented, filled to the width of the header."""
+    parts = text.split("\n\n")
+    filled = (part if part.startswith(" ") else textwrap.fill(part, 96) for part in parts)
+    return "\n\n".join(filled)
 
 
 def period_ms(made: Firmware) -> str:

@@ -264,6 +264,7 @@ def run(
     seed: int,
     out: Path,
     memory_file: Path | None,
+    firmware: Path | None = None,
     recorder_arguments: list[str],
     external: Collection[str] = (),
     cars: int = 0,
@@ -278,7 +279,8 @@ def run(
 
     `buses` has an entry for each train, and so has `controllers`, or none where the controller is
     one of the `external` nodes; `cars` are those that the plant takes a force for, each by itself;
-    `faults` is the folder of can_dbc/faults.py's receiver, `signals` go to the processes when it is
+    `firmware` is a library for the controllers; `faults` is the folder of can_dbc/faults.py's
+    receiver, `signals` go to the processes when it is
     time; `others` are further nodes by name, modules with their arguments; `linger` as in Bench. In
     lockstep, or in `real_time`.
 
@@ -318,6 +320,8 @@ def run(
             arguments = ["--calibration", str(flash(calibration, Path(scratch), name))]
             if memory_file is not None:
                 arguments += ["--memory", str(memory_file)]
+            if firmware is not None:
+                arguments += ["--firmware", str(firmware)]
             arguments += [*injected, "--train", str(train)]
             if real_time is not None:
                 folder = Path(scratch, f"{name}-timing")

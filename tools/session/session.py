@@ -24,7 +24,7 @@ import numpy as np
 from ato_hil.can_dbc import faults
 from ato_hil.can_dbc.bus import choose_bus, open_bus, recv_frames
 from ato_hil.can_dbc.errors import InputError
-from ato_hil.controller import node, store
+from ato_hil.controller import library, node, store
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.interface import fault_names
 from ato_hil.controller.registry import is_file, load_law
@@ -110,6 +110,7 @@ class Options:
     pace: str = LOCKSTEP
     spin_us: int = 0  # real time: busy wait of the plant before each deadline
     viewer: LiveView | None = None  # that looks on
+    firmware: Path | None = None  # library in place of the controller's compiled steps
 
 
 @dataclass(frozen=True)
@@ -268,12 +269,15 @@ def _controllers(options: Options, trains: list[Loaded]) -> tuple[str, list[Cali
         raise SessionError(f"an external node needs mode hil, this is {options.mode}")
     count = options.runs or loaded.scenario.runs
     if CONTROLLER in options.external:
-        if options.law is not None or options.memory is not None:
-            raise SessionError("law and memory of an external controller are its own")
+        if options.law or options.memory or options.firmware:
+            raise SessionError("law, memory and firmware of an external controller are its own")
         return EXTERNAL_LAW, [], range(1, count + 1)
     law = options.law or loaded.scenario.law
     load_law(law)
     calibrations = [onboard.calibration_for(train, law) for train in trains]
+    if options.firmware is not None:
+        for calibration in calibrations:
+            library.load(options.firmware, calibration)  # refuses what is not for this session
     learned = -1 if options.memory is None else node.last_iteration(calibrations[0], options.memory)
     return law, calibrations, onboard.run_numbers(law, count, learned)
 
@@ -366,7 +370,9 @@ def _set_digest(session: Session, digest: str, of_trains: list[str]) -> None:
 def _run_in_process(session: Session) -> None:
     options, calibrations = session.options, session.calibrations
     digest = LineDigest(len(calibrations))
-    nodes = [node.build(calibration, options.memory) for calibration in calibrations]
+    nodes = [
+        node.build(calibration, options.memory, options.firmware) for calibration in calibrations
+    ]
     session.summary["controller"] = {
         "state_bytes": nodes[0].state_bytes,
         "memory_bytes": nodes[0].memory_bytes,
@@ -551,6 +557,7 @@ def _run_hil(session: Session) -> None:
             seed=options.seed,
             out=options.out,
             memory_file=options.memory,
+            firmware=options.firmware,
             recorder_arguments=_recorder_arguments(session, kept),
             external=options.external,
             cars=_cars(loaded),
