@@ -176,15 +176,18 @@ def source_file(made: Translated) -> str:
     return text_of(resolved(program, lines, names))
 
 
-def preamble(body: list[str]) -> Iterator[str]:
-    """The helpers that are needed: a static function that nobody calls is a warning. host.c calls
-    two."""
+# Helpers that host.c calls.
+HOST_CALLS = ("min64", "floor_div", "cell_at")
+
+
+def preamble(body: list[str], others: tuple[str, ...] = HOST_CALLS) -> Iterator[str]:
+    """The helpers that are needed: a static function that nobody calls is a warning."""
     used = "\n".join(body)
     skip = False
     for line in (HERE / "preamble.c").read_text(encoding="utf-8").splitlines():
         if line.startswith("static"):
             name = line.split("(")[0].split()[-1]
-            skip = f"{name}(" not in used and name not in ("min64", "floor_div", "cell_at")
+            skip = f"{name}(" not in used and name not in others
         if not skip:
             yield line
         if line.startswith("}") or (line.startswith("static") and line.endswith("}")):
@@ -220,13 +223,15 @@ def first_line(tree: Any) -> str:
     return (ast.get_docstring(tree) or "").split("\n\n")[0].replace("\n", " ")
 
 
-def messages(program: Program) -> Iterator[str]:
+def messages(program: Program, scaled: bool = False) -> Iterator[str]:
     """The frames that are used: number of the mailbox, identifiers, place of each signal."""
     yield "/* Place of a signal in the mailbox word, from the DBC. */"
     yield "typedef struct {"
     yield "    int64_t start;  /* bit, 0..63 */"
     yield "    int64_t length; /* bits, 1..32 */"
     yield "    int64_t is_signed;"
+    if scaled:
+        yield "    double scale; /* physical unit per raw unit */"
     yield "} ato_signal;"
     yield ""
     yield "/* A message: its mailbox, identifier, Data-ID of the end-to-end protection, period. */"
@@ -253,7 +258,13 @@ def messages(program: Program) -> Iterator[str]:
         yield f"    .message = {{ {head} }},"
         for signal in signals:
             place = getattr(message, signal)
-            yield f"    .{signal} = {{ {place.start}, {place.length}, {place.is_signed} }},"
+            numbers = [
+                place.start,
+                place.length,
+                place.is_signed,
+                *([place.scale] if scaled else []),
+            ]
+            yield f"    .{signal} = {{ {', '.join(map(number_text, numbers))} }},"
         yield "};"
     yield ""
 

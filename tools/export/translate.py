@@ -137,6 +137,8 @@ class Program:
         self.constants: dict[tuple[str, Any], Constant] = {}
         self.tables: dict[int, Table] = {}
         self.messages: dict[str, Any] = {}
+        self.counted: dict[str, tuple[np.dtype, int]] = {}  # arrays that know their lengths
+        self.several: dict[str, Several] = {}  # tuples that steps return
         self.modules: list[Module] = []  # in the order in which they are needed
         self.used: list[Function] = []
 
@@ -197,7 +199,7 @@ class Program:
             case Array(item, ()):
                 return f"{self.item(item)} *"
             case Rows(item, dimensions):
-                return f"{self.rows_name(item, dimensions)} "
+                return f"{self.rows(item, dimensions)} "
             case Fields(name, _):
                 return f"const {name} *"
             case Layout(signals):
@@ -208,16 +210,20 @@ class Program:
                 return self.several_name(kind)
         raise ExportError(f"{kind}: no type in C")
 
+    def rows(self, dtype: np.dtype, dimensions: int) -> str:
+        """Type in C of an array that knows its lengths."""
+        stem = self.item(dtype).removesuffix("_t")
+        name = f"{stem}_rows" if dimensions == 1 else f"{stem}_table"
+        self.counted.setdefault(name, (dtype, dimensions))
+        return name
+
     def item(self, dtype: np.dtype) -> str:
         """Type in C of an item of an array."""
         return self.record_name(dtype) if dtype.names else c_number(dtype)
 
-    def rows_name(self, dtype: np.dtype, dimensions: int) -> str:
-        stem = self.item(dtype).removesuffix("_t")
-        return f"{stem}_rows" if dimensions == 1 else f"{stem}_table"
-
     def several_name(self, kind: Several) -> str:
         letters = "".join({"int64_t": "i", "double": "d", "bool": "b"}[k.c] for k in kind.kinds)
+        self.several[f"ato_{letters}"] = kind
         return f"ato_{letters}"
 
     def layout_name(self, signals: tuple[str, ...]) -> str:
@@ -1021,6 +1027,10 @@ class _Body:
                 return self._item(text, item, owner)
             case Rows(item, 1) if len(parts) == 1:
                 return self._item(f"{owner.text}.row[{parts[0].text}]", item, owner)
+            case Rows(item, 4) if len(parts) == 1:
+                # The learning memories of several trains.
+                text = f"({owner.text}.row + {self._in(parts[0], PRODUCT)} * {owner.text}.width)"
+                return Expression(text, Array(item, ("ATO_CELLS", "ATO_WORDS")), root=owner.root)
             case Rows(item, 2):
                 first = f"{self._in(parts[0], PRODUCT)} * {owner.text}.width"
                 if len(parts) == 1:

@@ -128,11 +128,13 @@ def run_line(
     runs: range,
     seed: int,
     progress: Callable[[int, int], None] | None = None,
+    loop: Any = None,
 ) -> Iterator[list[RunResult]]:
-    """The runs of all trains, with a controller for each in `nodes`; a result for each."""
+    """The runs of all trains, with a controller for each in `nodes`; a result for each. `loop` is
+    another one than that of `build_loop`, with the same arguments."""
     here = world.build(loaded, seed)
     params, state, cells = _put_side_by_side(nodes, here)
-    loop = build_loop(nodes[0].tick, here.sense, here.actuate_and_advance)
+    loop = loop or build_loop(nodes[0].tick, here.sense, here.actuate_and_advance)
     trains = len(nodes)
     counts = np.zeros(trains, np.int64)
 
