@@ -21,9 +21,8 @@ MAY_IMPORT = {
 ROOMS = (
     {"runs"},
     {"trace"},
-    {"export"},
     {"session"},
-    {"campaigns", "papers"},
+    {"campaigns", "papers", "export"},
     {"verify", "reports", "bench"},
     {"cli"},
 )

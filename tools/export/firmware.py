@@ -534,7 +534,7 @@ __all__ = [
     "Translated",
     "can_file",
     "cmake_file",
+    "codec",
     "config_file",
     "header_file",
-    "codec",
 ]
