@@ -287,6 +287,12 @@ def begin(state: Any) -> None:
 
 
 @step
+def first_word(params: Any) -> Any:
+    """Of the estimator; its words are words of the cell whatever the calibration says."""
+    return clamp(int64(params.estimator), int64(0), int64(INPUT + HORIZON_MAX))
+
+
+@step
 def limited_phi(component: Any, phi: Any) -> Any:
     """phi1 (component 0) or phi2 inside its bounds, Q30: (14)."""
     if component == 0:
@@ -304,7 +310,7 @@ def next_speed(phi_1: Any, phi_2: Any, v: Any, s: Any) -> Any:
 def estimate(params: Any, state: Any, cell: Any, dv: Any, initial: Any) -> None:
     """(13), (14), (17), (18) for the tick before, into the words that the memory keeps for it; in
     run 0 the words begin anew."""
-    first = int64(params.estimator)
+    first = first_word(params)
     last_dv = int64(state.dv)
     last_ds = int64(state.ds)
     phi_1 = limited_phi(int64(0), int64(state.estimator[0]))
@@ -343,7 +349,7 @@ def adapt(params: Any, state: Any, cell: Any, component: Any, phi: Any) -> None:
     """
     psi = component * ORDER
     theta = 2 * ORDER + psi
-    first = int64(params.estimator)
+    first = first_word(params)
     predicted = int64(0)
     square = int64(params.delta)
     for w in range(ORDER):
@@ -365,7 +371,7 @@ def adapt(params: Any, state: Any, cell: Any, component: Any, phi: Any) -> None:
 @step
 def recall_psi(params: Any, state: Any, cell: Any) -> None:
     """state.psi for run n: what the last run estimated, or phi = [1, 0]."""
-    first = int64(params.estimator)
+    first = first_word(params)
     for w in range(2 * ORDER):
         state.psi[w] = cell.before[first + w] if first > 0 else 0
     if first == 0:
@@ -377,7 +383,7 @@ def predict(params: Any, state: Any, cell: Any) -> None:
     """(15), (16): state.psi from run n+l-1 to run n+l."""
     for component in range(2):
         psi = component * ORDER
-        theta = int64(params.estimator) + 2 * ORDER + psi
+        theta = first_word(params) + 2 * ORDER + psi
         phi = int64(0)
         for w in range(ORDER):
             phi += round_shift(int64(cell.before[theta + w]) * int64(state.psi[psi + w]), 29)
@@ -522,6 +528,7 @@ def iplc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
     outputs.estimate[1] = cell.smooth
     outputs.estimate[2] = sat32(-int64(state.z_v[0]))
     outputs.estimate[3] = sat32(-round_shift(int64(state.z_s[0]), 9))
-    outputs.estimate[4] = state.plan[int64(params.horizon) - 1]
+    last = clamp(int64(params.horizon) - 1, int64(0), int64(HORIZON_MAX - 1))
+    outputs.estimate[4] = state.plan[last]
     outputs.estimate[5] = state.psi[0]
     outputs.estimate[6] = state.psi[ORDER]

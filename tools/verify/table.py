@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 from ato_hil.can_dbc.step import INTERPRETED
 from ato_hil.controller.registry import law_names, load_law
+from ato_hil.controller.source import RULES, steps_of
+from ato_hil.controller.subset import check
 from ato_hil.tools.verify import (
     ABSENT,
     PASSED,
@@ -73,16 +75,15 @@ def _checks(laws: list[str], fast: bool) -> Iterator[Row]:
 def check_subset(laws: list[str]) -> Row:
     """The linter over the shared modules and these laws."""
     modules = subset.linted_modules(laws)
-    found = subset.check(modules)
-    steps = sum(len(subset.steps_of(module)) for module in modules)
+    found = check(modules)
+    steps = sum(len(steps_of(module)) for module in modules)
     text = (
-        "; ".join(map(str, found))
-        or f"{len(subset.RULES)} rules, {steps} steps in {len(modules)} modules"
+        "; ".join(map(str, found)) or f"{len(RULES)} rules, {steps} steps in {len(modules)} modules"
     )
     return row(
         "portable subset",
         "all steps",
-        "syntax tree and records, with line numbers",
+        "syntax tree, records, every index within its array",
         text,
         not found,
     )
