@@ -39,6 +39,12 @@ from ato_hil.controller.source import (
 
 ARGUMENTS = ("params", "state", "cell", "inputs", "outputs")
 READ_ONLY = ("params", "inputs", "constant", "cell.before", "cell.ahead", "cell.smooth")
+# Arrays of the shared records of which a law has what it declares.
+DECLARED = {
+    "outputs.estimate": " by ESTIMATES",
+    "cell.before": " by WORDS",
+    "cell.learn": " by WORDS",
+}
 TURNS_MAX = 1000  # of a loop
 DEPTH_MAX = 64  # of calls
 SHIFT_MAX = 62
@@ -438,11 +444,8 @@ class _Frame:
             return self._add(node, "index", what)
         for one, length in zip(at, base.shape, strict=False):
             if one is not None and not (one.low >= 0 and one.high < length):
-                return self._add(
-                    node,
-                    "index",
-                    f"{ast.unparse(node)}: index {_range(one)}, {base.path} has {length}",
-                )
+                what = f"{ast.unparse(node)}: index {_range(one)}, {base.path} has {length}"
+                return self._add(node, "index", f"{what}{DECLARED.get(base.path, '')}")
         rest = base.shape[len(at) :]
         return Array(base.item, rest, base.path) if rest else _held(base.item, base.path)
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import keyword
 import pkgutil
 import sys
 import traceback
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,6 +17,7 @@ from typing import Any
 from ato_hil.can_dbc.codec import choices
 from ato_hil.can_dbc.errors import InputError
 from ato_hil.controller import laws
+from ato_hil.controller import laws, subset
 
 PARTS = ("PARAMS", "STATE", "WORDS", "ESTIMATES", "Gains", "calibrate")  # of a law's module
 
@@ -48,40 +51,56 @@ def load_law(name: str) -> ModuleType:
 
 
 def _load_file(path: Path) -> ModuleType:
-    """The module of a law outside this package, executed once in a process."""
+    """The module of a law outside this package, executed once in a process, and refused where it
+    breaks the portable subset."""
     name = f"own_law.{path.stem}"
     known = sys.modules.get(name)
     if known is not None and known.__file__ == str(path.resolve()):
         return known
     if not path.is_file():
         raise LawError(f"{path}: no such law file")
-    spec = importlib.util.spec_from_file_location(name, path.resolve())
-    if spec is None or spec.loader is None or not path.stem.isidentifier():
+    if not path.stem.isidentifier() or keyword.iskeyword(path.stem):
         raise LawError(f"{path}: the file of a law is named as its step, expected an identifier")
+    if law_label(str(path)) in law_names():
+        raise LawError(
+            f"{path}: {law_label(str(path))} is a law of the house, expected another name for file"
+            " and step"
+        )
+    spec = importlib.util.spec_from_file_location(name, path.resolve())
+    if spec is None or spec.loader is None:
+        raise LawError(f"{path}: cannot be loaded as Python")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # whatever the file does when it is executed
+    except (Exception, SystemExit) as error:  # whatever the file does when it is executed
         del sys.modules[name]
-        raise LawError(f"{_place(path, error)}: {type(error).__name__}: {error}") from None
+        raise LawError(place(path, error)) from None
     for part in (*PARTS, path.stem):
         if not hasattr(module, part):
             del sys.modules[name]
             raise LawError(f"{path}: expected {part}, see the laws in {laws.__path__[0]}")
+    found = subset.check([module])
+    if found:
+        del sys.modules[name]
+        more = f" ({len(found) - 1} more)" if len(found) > 1 else ""
+        file = str(path) if found[0].file == str(path.resolve()) else found[0].file
+        raise LawError(f"{replace(found[0], file=file)}{more}")
     return module
 
 
-def _place(path: Path, error: Exception) -> str:
-    """File and line of an error in a law's file."""
-    if isinstance(error, SyntaxError):
-        return f"{path}:{error.lineno}"
+def place(path: Path, error: BaseException) -> str:
+    """One line of an error in a law's file: file, line, kind and text."""
     lines = [
         frame.lineno
         for frame in traceback.extract_tb(error.__traceback__)
         if frame.filename == str(path.resolve())
     ]
-    return f"{path}:{lines[-1]}" if lines else str(path)
+    if isinstance(error, SyntaxError):
+        lines = [error.lineno]
+    at = f"{path}:{lines[-1]}" if lines and lines[-1] else str(path)
+    text = " ".join(str(error.msg if isinstance(error, SyntaxError) else error).split())
+    return f"{at}: {type(error).__name__}: {text}"
 
 
 def law_step(module: ModuleType) -> Any:

@@ -85,7 +85,7 @@ def is_law(module: ModuleType) -> bool:
 def _in_order(found: list[Finding]) -> list[Finding]:
     """By file and line; what two rules say of the same is said once."""
     kept: dict[tuple[str, int, str], Finding] = {}
-    for one in sorted(found, key=lambda f: (f.file, f.line)):
+    for one in sorted(found, key=lambda f: (f.file, f.line, f.rule == "widen")):
         kept.setdefault((one.file, one.line, one.rule), one)
     return list(kept.values())
 
@@ -195,17 +195,21 @@ def _takes(function: Any, count: int) -> bool:
 
 
 def _line_of(module: ModuleType, name: str) -> int:
-    """Where the top of a module defines a name, 1 if it does not."""
+    """Where the top of a module defines a name last, 1 if it does not."""
+    line = 1
     for node in tree_of(module).body:
         match node:
             case ast.Assign(targets=targets):
-                if any(isinstance(t, ast.Name) and t.id == name for t in targets):
-                    return node.lineno
-            case ast.AnnAssign(target=ast.Name(id=defined)) if defined == name:
-                return node.lineno
-            case ast.FunctionDef(name=defined) | ast.ClassDef(name=defined) if defined == name:
-                return node.lineno
-    return 1
+                defined = [t.id for t in targets if isinstance(t, ast.Name)]
+            case ast.AnnAssign(target=ast.Name(id=one)):
+                defined = [one]
+            case ast.FunctionDef(name=one) | ast.ClassDef(name=one):
+                defined = [one]
+            case _:
+                defined = []
+        if name in defined:
+            line = node.lineno
+    return line
 
 
 # Records.
@@ -233,7 +237,8 @@ def _made_records(module: ModuleType) -> dict[str, ast.stmt]:
 def _record(
     module: ModuleType, name: str, kind: np.dtype, statement: ast.stmt
 ) -> Iterator[Finding]:
-    for field, rule, text in record_findings(kind):
+    found = list(record_findings(kind))
+    for field, rule, text in [one for one in found if one[1] != "padding"] or found:
         line = _line_of_field(statement, field)
         yield finding(shown(module), line, rule, f"{name}: {text}")
     if kind.names is not None and not kind.isalignedstruct:

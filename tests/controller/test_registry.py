@@ -15,10 +15,15 @@ from ato_hil.controller.registry import (
 
 LAW = """
 import msgspec
-PARAMS = STATE = WORDS = ESTIMATES = ()
+import numpy as np
+from ato_hil.can_dbc.step import step
+STATE = np.dtype([("last", np.int32)], align=True)
+PARAMS = STATE
+WORDS = ESTIMATES = ()
 class Gains(msgspec.Struct): pass
 def calibrate(gains, vehicle): pass
-def mine(params, state, cell, inputs, outputs): pass
+@step
+def mine(params, state, cell, inputs, outputs): outputs.force = 0
 """
 
 
@@ -64,7 +69,7 @@ def test_files_of_one_name_are_two_laws(tmp_path):
         ("x = 1\nif :\n", "{file}:2: SyntaxError: invalid syntax"),
         ("x = 1\n\nx / 0\n", "{file}:3: ZeroDivisionError: division by zero"),
         ("import no_such_module\n", "{file}:1: ModuleNotFoundError: No module named"),
-        (LAW.replace("STATE = ", ""), "{file}: expected STATE, see the laws in"),
+        (LAW.replace("STATE", "STORE"), "{file}: expected STATE, see the laws in"),
         (LAW.replace("calibrate", "set_up"), "{file}: expected calibrate, see the laws in"),
         (LAW.replace("mine", "yours"), "{file}: expected mine, see the laws in"),
     ],

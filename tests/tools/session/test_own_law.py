@@ -39,6 +39,30 @@ def test_the_law_follows_the_profile_with_its_gains_and_without(ato_hil, folder)
     assert mine["digest"] != plain["digest"], "the table of gains counts"
 
 
+COMMANDS = (
+    ("run", "plain.toml", "--law", "./tracking.py", "--mode", "sil"),
+    ("run", "plain.toml", "--law", "./tracking.py"),
+    ("compare", "plain.toml", "--laws", "./tracking.py,cailc"),
+    ("sweep", "plain.toml", "--law", "./tracking.py", "--vary", "law.kp=1,2"),
+    ("verify", "./tracking.py"),
+    ("bus-report", "plain.toml", "--law", "./tracking.py"),
+)
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: " ".join(command[:1]))
+def test_what_firmware_may_not_do_is_refused_as_the_page_says(ato_hil, folder, command):
+    file = folder / "tracking.py"
+    last = "    outputs.estimate[0] = new\n"
+    text = file.read_text(encoding="utf-8")
+    file.write_text(text.replace(last, f"{last}    outputs.estimate[1] = ed\n"), encoding="utf-8")
+    shown = re.search(r"^    (ato-hil: tracking\.py:\d+: index: .*)$", PAGE, re.MULTILINE)
+    assert shown is not None
+    done = ato_hil(*command, cwd=folder)
+    assert done.returncode == 1, done.stdout
+    assert done.stderr == f"{shown[1]}\n"
+    assert not (folder / "runs").exists()
+
+
 def test_an_unknown_gain_is_named(ato_hil, short_text, folder):
     (folder / "mine.toml").write_text(short_text + GAINS + "kq = 1.0\n")
     done = ato_hil("run", "mine.toml", "--law", "./tracking.py", "--mode", "sil", cwd=folder)
