@@ -44,7 +44,13 @@ from ato_hil.controller.quantise import (
     Vehicle,
     fixed,
 )
-from ato_hil.controller.registry import law_label, law_number, load_law
+from ato_hil.controller.registry import (
+    is_file,
+    law_label,
+    law_number,
+    load_law,
+    place,
+)
 
 FORMAT = "ato-hil calibration 1"
 AGE_MAX_TICKS = 1000
@@ -145,12 +151,16 @@ def calibrate(
     params["core"] = _core(module, law, vehicle)
     try:
         typed = msgspec.convert(gains, module.Gains)
-        params["law"] = module.calibrate(typed, vehicle)
-        words = _words(module, typed, vehicle)
-        recall = module.recall(typed) if hasattr(module, "recall") else None
-        pitch_m = module.pitch_m(typed) if hasattr(module, "pitch_m") else None
+        with np.errstate(invalid="raise"):  # a float that no integer holds
+            params["law"] = _law(module, module.calibrate(typed, vehicle))
+            words = _words(module, typed, vehicle)
+        recall = _recalled(module, typed, int(words["words"][0]))
+        pitch_m = _pitch_m(module, typed)
     except (msgspec.ValidationError, CalibrationError) as error:
         raise CalibrationError(f"laws.{law_label(law)}: {error}") from None
+    except Exception as error:  # whatever the law's own Python does
+        where = place(Path(law) if is_file(law) else Path(module.__file__ or ""), error)
+        raise CalibrationError(f"laws.{law_label(law)}: {where}") from None
     params["gradient_map"] = gradient_map.calibrate(map_sections)
     params["guard"] = _guard(guard_settings, vehicle.period_s)
     start_m = line.start_m if line else 0.0
@@ -324,6 +334,40 @@ def _core(module: Any, law: str, vehicle: Vehicle) -> np.ndarray:
     return core
 
 
+def _law(module: Any, params: Any) -> np.ndarray:
+    """What `calibrate` of a law gave, if that is PARAMS."""
+    if isinstance(params, np.ndarray) and params.dtype == module.PARAMS and params.shape == (1,):
+        return params
+    given = type(params).__name__
+    if isinstance(params, np.ndarray):
+        record = "PARAMS" if params.dtype == module.PARAMS else "another type"
+        given = f"{record}, shape {params.shape}"
+    raise CalibrationError(f"calibrate returns {given}, expected PARAMS, shape (1,)")
+
+
+def _recalled(module: Any, gains: Any, words: int) -> Recall | None:
+    """What a law sees of the last run, if it does: within the words that it stores."""
+    if not hasattr(module, "recall"):
+        return None
+    found: Recall = module.recall(gains)
+    if not isinstance(found, Recall):
+        raise CalibrationError(f"recall returns {found!r}, expected a Recall")
+    _whole("recall: smooth_word", found.smooth_word, 0, words - 1)
+    _whole("recall: smooth_ticks", found.smooth_ticks, 0, memory.SMOOTH_MAX)
+    _whole("recall: late_word", found.late_word, 0, words)
+    return found
+
+
+def _pitch_m(module: Any, gains: Any) -> float | None:
+    """Length of a cell of a law that learns along the track, at least 1 m."""
+    if not hasattr(module, "pitch_m"):
+        return None
+    found = float(module.pitch_m(gains))
+    if not 1 <= found < float("inf"):
+        raise CalibrationError(f"pitch_m is {found:g}, expected 1 or more")
+    return found
+
+
 def _reference(period_s: float, profile: np.ndarray, preview_ticks: int) -> np.ndarray:
     params = np.zeros(1, reference.REFERENCE_PARAMS)
     speed, acceleration = 3 / period_s, 6 / period_s**2
@@ -343,8 +387,22 @@ def _words(module: Any, gains: Any, vehicle: Vehicle) -> np.ndarray:
         return params
     initial, low, high = module.learned(gains, vehicle)
     words = len(initial)
+    if not 1 <= words <= len(module.WORDS) or not words == len(low) == len(high):
+        lengths = f"{words}, {len(low)}, {len(high)}"
+        raise CalibrationError(
+            f"learned returns {lengths} values, expected three times 1 to {len(module.WORDS)}"
+        )
+    for (name, _unit, _q), at, lowest, highest in zip(
+        module.WORDS, initial, low, high, strict=False
+    ):
+        if not INT32_MIN <= lowest <= at <= highest <= INT32_MAX:
+            raise CalibrationError(
+                f"learned: {name} begins at {at}, between {lowest} and {highest}; expected low <="
+                " initial <= high in 32 bits"
+            )
     # A law whose gains learn only its first words stores only these; the others keep their value.
-    params["words"] = getattr(module, "words_stored", lambda _: words)(gains)
+    stored = getattr(module, "words_stored", lambda _: words)(gains)
+    params["words"] = _whole("words_stored", stored, 1, words)
     params["initial"][0, :words] = initial
     params["low"][0, :words] = low
     params["high"][0, :words] = high

@@ -685,3 +685,103 @@ def test_an_operation_stays_within_its_bounds(operation, a, b, data):
     if -(2**63) <= result < 2**63:
         assert isinstance(bound, bounds.Int)
         assert bound.low <= result <= bound.high
+
+
+# What `calibrate` and its like do wrongly, named with file and line.
+
+
+def calibrated(folder: Path, text: str) -> None:
+    from ato_hil.plant_sim.scenario import load
+    from ato_hil.tools.runs import onboard
+
+    written(folder, text)
+    onboard.calibration_for(load("subway-paper"), "./sliding.py")
+
+
+CALIBRATIONS = {
+    "a division by zero": ("1 / gains.phi", "1 / (gains.phi - gains.phi)", "ZeroDivisionError"),
+    "a name that is not defined": (
+        '["force_max"] = fixed(',
+        '["force_max"] = fixd(',
+        "NameError: name 'fixd' is not defined",
+    ),
+    "a field that PARAMS lacks": (
+        'params["force_max"]',
+        'params["force"]',
+        "no field of name force",
+    ),
+    "a gain that there is not": ("gains.lam,", "gains.lambda_,", "has no attribute 'lambda_'"),
+    "an index": ('params["gain"][0, k]', 'params["gain"][k, 0]', "IndexError: index 1 is out of"),
+    "a whole number that is too large": (
+        'fixed("lam", gains.lam, 24)',
+        "int(gains.lam * 2**40)",
+        "OverflowError",
+    ),
+    "an array of floats that are too large": (
+        'fixed("lam", gains.lam, 24)',
+        "np.array([gains.lam * 2.0**40])",
+        "FloatingPointError: invalid value encountered in cast",
+    ),
+    "what is not a number": ('fixed("lam", gains.lam, 24)', 'np.array([float("nan")])', "cast"),
+    "a string": ('fixed("lam", gains.lam, 24)', '"much"', "ValueError: invalid literal"),
+    "a value too few of learned": ("[0, 0], [-(1 << 27), 0]", "[0], [-(1 << 27), 0]", ""),
+    "recursion without end": (
+        "    params = np.zeros(1, PARAMS)\n",
+        "    params = calibrate(gains, vehicle)\n",
+        "RecursionError",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CALIBRATIONS)
+def test_a_mistake_in_calibrate_is_named_with_its_line(name, tmp_path, monkeypatch):
+    old, new, holds = CALIBRATIONS[name]
+    assert old in SLIDING
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError) as error:
+        calibrated(tmp_path, SLIDING.replace(old, new, 1))
+    said = str(error.value)
+    assert "\n" not in said
+    assert holds in said
+    assert "laws.sliding: " in said
+    if holds:
+        found = re.search(r"laws\.sliding: sliding\.py:(\d+): ", said)
+        assert found, said
+        text = (tmp_path / "sliding.py").read_text(encoding="utf-8").splitlines()
+        assert new.splitlines()[0].strip() in text[int(found[1]) - 1]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("    return params\n", "    return None\n", "calibrate returns NoneType, expected PARAMS"),
+        ("    return params\n", "    return np.zeros(2, PARAMS)\n", "returns PARAMS, shape (2,)"),
+        (
+            "    return params\n",
+            "    return np.zeros(1, STATE)\n",
+            "returns another type, shape (1,)",
+        ),
+        ("[0, 0], [-(1", "[0, 0, 0], [-(1", "learned returns 3, 2, 2 values"),
+        ("[0, 0], [-(1", "[9, 9], [-(1", "spare begins at 9, between 0 and 0"),
+        ("[1 << 27, 0]", "[1 << 40, 0]", "d begins at 0, between -134217728 and 1099511627776"),
+        ("@step\n", "def words_stored(gains):\n    return 3\n\n\n@step\n", "words_stored is 3"),
+        ("@step\n", "def pitch_m(gains):\n    return 0.0\n\n\n@step\n", "pitch_m is 0, expected 1"),
+        (
+            "@step\n",
+            "def recall(gains):\n    return 3\n\n\n@step\n",
+            "recall returns 3, expected a",
+        ),
+        (
+            "@step\n",
+            "def recall(gains):\n    from ato_hil.controller.quantise import Recall\n\n"
+            "    return Recall(0, 2, 0, 0)\n\n\n@step\n",
+            "recall: smooth_word is 2, expected 0 to 1",
+        ),
+    ],
+)
+def test_what_calibrate_and_its_like_return_is_checked(old, new, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError) as error:
+        calibrated(tmp_path, SLIDING.replace(old, new, 1))
+    assert f"laws.sliding: {said}" in str(error.value) or said in str(error.value)
+    assert "\n" not in str(error.value)
