@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from ato_hil.tools.cli.console import EXIT_BAD_INPUT, console, fail, one_line_for_bad_input
+from ato_hil.tools.cli.console import (
+    EXIT_BAD_INPUT,
+    EXIT_ENDED_EARLY,
+    console,
+    fail,
+    one_line_for_bad_input,
+)
 from ato_hil.tools.cli.options import Channel, LawName, Recording, ScenarioName
 
 if TYPE_CHECKING:
@@ -49,6 +55,8 @@ def replay(
             console.print(
                 f"run {result.run}: {result.ticks} ticks, {result.commands} commands as recorded"
             )
+        if prepared.missing:
+            raise fail(f"{recording}: {'; '.join(prepared.missing)}", EXIT_ENDED_EARLY)
 
 
 def decode(
@@ -61,13 +69,16 @@ def decode(
         from ato_hil.tools.runs import decode as tables
 
         done = tables.decode(recording, out, channel)
-    console.print(f"{out}: {done.rows} frames, {len(done.messages)} messages", soft_wrap=True)
-    if done.unknown or done.foreign:
-        console.print(
-            f"left out: {done.unknown} frames that the DBC does not have,"
-            f" {done.foreign} of other kinds or channels",
-            style="dim",
-        )
+    console.print(
+        f"{out}: {done.rows} frames, {len(done.messages)} messages", soft_wrap=True, markup=False
+    )
+    notes = list(done.notes)
+    if done.unknown:
+        notes.insert(0, f"{done.unknown} frames that the DBC does not have are left out")
+    for note in notes:
+        console.print(note, style="dim", soft_wrap=True, markup=False)
+    if done.missing:
+        raise fail(f"{recording}: {done.missing}", EXIT_ENDED_EARLY)
 
 
 def bus_report(

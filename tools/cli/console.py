@@ -17,7 +17,7 @@ console = Console(highlight=False, width=None if sys.stdout.isatty() else 150)
 errors = Console(stderr=True, highlight=False)
 
 EXIT_BAD_INPUT = 1
-EXIT_ENDED_EARLY = 3
+EXIT_ENDED_EARLY = 3  # a session, or a recording
 EXIT_INTERRUPTED = 130
 
 

@@ -53,6 +53,10 @@ LawName = Annotated[str | None, typer.Option(help="Control law; the scenario's b
 Runs = Annotated[int | None, typer.Option(min=1, help="Runs in a row; the scenario's by default.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of noise and disturbance.")]
 Recording = Annotated[
-    Path, typer.Argument(metavar="FILE", help="Recording: .blf, .asc, .log (candump -L), .mf4.")
+    Path,
+    typer.Argument(
+        metavar="FILE",
+        help="Recording: .blf, .asc, .log (candump -L), .pcapng, .mf4, or one with .gz behind that.",
+    ),
 ]
 Channel = Annotated[str | None, typer.Option(help="The channel, if several carry our frames.")]

@@ -150,7 +150,7 @@ def run(
     trace: Annotated[bool, typer.Option(help="Write trace.rrd.")] = True,
     record: Annotated[
         Path | None,
-        typer.Option(help="Record every frame of the runs: FILE.blf, .asc, .log or .mf4."),
+        typer.Option(help="Record every frame of the runs: FILE.blf, .asc, .log, .pcapng or .mf4."),
     ] = None,
     external: Annotated[
         list[External] | None,

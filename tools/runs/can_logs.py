@@ -2,7 +2,8 @@
 
 A recording holds the frames that the digest stands for, those of the runs, in bus order. Their
 time is that of the simulation: it starts at 0 and goes on from run to run, so that SIL and HIL
-leave the same recording. python-can's writers make the file; its suffix says which.
+leave the same recording. The suffix of a file says its format: `ato_hil.tools.runs.formats` reads all of them,
+python-can writes all but pcapng.
 
 Beside FILE lies FILE.json, what `ato-hil replay` has to know of the session, and FILE.memory if
 the session began with a learning memory.
@@ -10,17 +11,15 @@ the session began with a learning memory.
 
 from __future__ import annotations
 
-import gc
 import importlib.util
-import logging
 import os
 import queue
 import shutil
-import struct
 import sys
 import threading
+from array import array
+from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -34,7 +33,17 @@ from can.io.mf4 import MF4Writer
 from ato_hil.can_dbc import e2e
 from ato_hil.can_dbc.codec import INDEX_OF_FRAME_ID, TRAIN_POSITION, get
 from ato_hil.can_dbc.errors import InputError
+from ato_hil.tools.runs import formats
+from ato_hil.tools.runs.formats import pcapng
+from ato_hil.tools.runs.formats.common import (
+    CutOff,
+    Damaged,
+    Incomplete,
+    Row,
+)
+from ato_hil.tools.runs import files
 from ato_hil.tools.runs.frames import (
+    ENDED,
     FRAME,
     RUNNING,
     columns,
@@ -42,16 +51,10 @@ from ato_hil.tools.runs.frames import (
     ticks_of,
 )
 
-FORMATS = {
-    ".asc": "a Vector ASC log",
-    ".blf": "a Vector BLF log",
-    ".log": "a log of candump -L",
-    ".mf4": "an ASAM MDF 4 file of CAN frames",
-}
-EXPECTED = "expected a name that ends in .blf, .asc, .log or .mf4"
-CHANNEL = 0  # python-can's first; "can0" in a .log
+EXPECTED = "expected a name that ends in .blf, .asc, .log, .pcapng or .mf4"
+CHANNEL = 0  # python-can's first; "can0" in a .log and a .pcapng
 BATCH_FRAMES = 10_000
-MDF_HEADER_BYTES = 64 + 104  # blocks ID and HD, which every file begins with
+MOST_CHANNELS = 1 << 10
 SCHEMA = 1
 
 
@@ -69,16 +72,35 @@ class Origin(msgspec.Struct, frozen=True, kw_only=True):
     mode: str
     seed: int
     memory: str | None  # file in the folder of the recording: the memory before the first run
+    frames: int | None = None  # how many the session has recorded; none until it has ended
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What was read from a recording, frame by frame in bus order."""
+    """What was read from a recording, frame by frame in the order of the file."""
 
-    time_s: np.ndarray  # [n] float64, as in the file
+    time_s: np.ndarray  # [n] float64, as in the file, where it may also go back or jump
     frame_ids: np.ndarray  # [n] int32
     words: np.ndarray  # [n] int64, mailbox words
-    foreign: int  # frames left out: all but standard data frames of 8 bytes on the channel
+    left_out: dict[str, int]  # all but standard data frames of 8 bytes on the channel, by kind
+    missing: str  # what of the file could not be read; empty if it is whole
+    closed: bool  # it holds as many frames as its session has recorded until it ended
+
+    @property
+    def foreign(self) -> int:
+        """How many frames are left out."""
+        return sum(self.left_out.values())
+
+    def notes(self) -> list[str]:
+        """What a user should know of these frames, a line each."""
+        notes = []
+        if self.left_out:
+            kinds = ", ".join(f"{count} {kind}" for kind, count in self.left_out.items())
+            notes.append(f"{self.foreign} frames of other kinds or channels are left out: {kinds}")
+        back = np.flatnonzero(np.diff(self.time_s) < 0)
+        if len(back):
+            notes.append(f"time goes back {len(back)} times, first after frame {back[0] + 1}")
+        return notes
 
 
 @dataclass(frozen=True)
@@ -88,6 +110,7 @@ class RecordedRun:
     number: int
     start: int  # its first row in the recording
     frames: np.ndarray  # [n] of frames.FRAME
+    ended: bool  # a RUN_CTRL says so
 
 
 # Writing
@@ -95,6 +118,8 @@ class RecordedRun:
 
 def check_target(path: Path) -> None:
     """Raise RecordError if no recording can be written there."""
+    if path.suffix.lower() == formats.GZIP:
+        raise RecordError(f"{path}: {EXPECTED}")
     check_suffix(path)
     folder = path.absolute().parent
     if not folder.is_dir():
@@ -105,16 +130,17 @@ def check_target(path: Path) -> None:
 
 def check_suffix(path: Path) -> None:
     """Raise RecordError if there is no reader and writer for files of this name."""
-    suffix = path.suffix.lower()
-    if suffix not in FORMATS:
+    suffix = formats.suffix_of(path)
+    if suffix not in formats.FORMATS:
         raise RecordError(f"{path}: {EXPECTED}")
     if suffix == ".mf4" and importlib.util.find_spec("asammdf") is None:
         raise RecordError(f"{path}: .mf4 needs asammdf: pip install 'ato-hil[mf4]'")
 
 
 def beside(path: Path, ending: str) -> Path:
-    """FILE.ending."""
-    return path.with_name(f"{path.name}.{ending}")
+    """FILE.ending; of FILE.gz too."""
+    inner = path.with_suffix("") if path.suffix.lower() == formats.GZIP else path
+    return inner.with_name(f"{inner.name}.{ending}")
 
 
 def save_origin(
@@ -143,10 +169,15 @@ def save_origin(
         copy.unlink(missing_ok=True)
         if memory_file is not None and origin.memory is not None:
             shutil.copyfile(memory_file, copy)
-        text = msgspec.json.format(msgspec.json.encode(origin), indent=1)
-        beside(path, "json").write_bytes(text + b"\n")
+        _save(path, origin)
     except OSError as error:
         raise RecordError(f"{error.filename}: cannot be written: {error.strerror}") from None
+
+
+def _save(path: Path, origin: Origin) -> None:
+    """Write FILE.json. Raises OSError."""
+    text = msgspec.json.format(msgspec.json.encode(origin), indent=1)
+    files.write_bytes(beside(path, "json"), text + b"\n")
 
 
 class Recording:
@@ -166,10 +197,11 @@ class Recording:
         self._path = path
         self._period_s = period_s
         try:
-            self._writer = can.Logger(str(path))
+            self._writer = _writer_of(path)
         except OSError as error:
             raise RecordError(f"{path}: cannot be written: {error.strerror}") from None
         self._start_tick = 0  # of the next run
+        self._frames = 0
         self._last_run = -1
         self._error: Exception | None = None
         self._runs: queue.SimpleQueue[tuple[int, np.ndarray] | None] = queue.SimpleQueue()
@@ -245,6 +277,8 @@ class Recording:
             self._room.release()
         try:
             self._writer.stop()
+            if self._error is None:
+                _announce(self._path, self._frames)
         except Exception as error:
             self._error = self._error or error
 
@@ -254,12 +288,31 @@ class Recording:
         time_s = (self._start_tick + batch["tick"].astype(np.int64)) * self._period_s
         try:
             write_frames(self._writer, time_s, batch)
+            self._frames += len(batch)
         except Exception as error:  # the writers and asammdf raise what they like
             self._error = error
 
 
+def _writer_of(path: Path) -> Any:
+    """What `write_frames` writes to. Raises OSError."""
+    if path.suffix.lower() == ".pcapng":
+        return pcapng.Writer(path, f"can{CHANNEL}")
+    return can.Logger(str(path))
+
+
+def _announce(path: Path, frames: int) -> None:
+    """Say in FILE.json, where there is one, that the session left so many. Raises RecordError,
+    OSError."""
+    origin = load_origin(path)
+    if origin is not None:
+        _save(path, msgspec.structs.replace(origin, frames=frames))
+
+
 def write_frames(writer: Any, time_s: np.ndarray, frames: np.ndarray) -> None:
-    """Hand FRAME rows to a writer of python-can. Raises OSError."""
+    """Hand FRAME rows to a writer of `_writer_of`. Raises OSError."""
+    if isinstance(writer, pcapng.Writer):
+        writer.write(time_s, frames["frame_id"], frames["payload"])
+        return
     if isinstance(writer, MF4Writer):
         _write_columns(writer, time_s, frames)
         return
@@ -295,135 +348,131 @@ def _write_columns(writer: Any, time_s: np.ndarray, frames: np.ndarray) -> None:
 
 
 def read(path: Path, channel: str | None = None) -> Recorded:
-    """Read a recording, or the log of another tool.
+    """Read a recording, or the log of another tool, as far as it goes.
 
     :param channel: the one that carries our frames; needed if several do.
-    :raises RecordError: the file is missing, damaged, cut off or empty, or of another kind.
+    :raises RecordError: the file is missing, empty, of another kind, or none of it can be read.
     """
     check_suffix(path)
-    time_s: list[float] = []
-    frame_ids: list[int] = []
-    words: list[int] = []
-    channels: list[str] = []
-    foreign = 0
-    for message in _messages(path):
-        name = str(message.channel)
-        if channel is not None and name != channel:
-            continue
-        if (
-            message.is_extended_id
-            or message.is_remote_frame
-            or message.is_error_frame
-            or message.is_fd
-            or len(message.data) != 8
-        ):
-            foreign += 1
-            continue
-        time_s.append(message.timestamp)
-        frame_ids.append(message.arbitration_id)
-        words.append(int.from_bytes(message.data, "little", signed=True))
-        channels.append(name)
-    if not frame_ids and not foreign:
-        where = f" on channel {channel!r}" if channel is not None else ""
-        raise RecordError(f"{path}: holds no CAN frames{where}")
-    rows = zip(frame_ids, channels, strict=True)
-    ours = sorted({name for can_id, name in rows if can_id in INDEX_OF_FRAME_ID})
-    if len(ours) > 1:
-        raise RecordError(
-            f"{path}: channels {', '.join(ours)} all carry frames of the DBC;"
-            " name one with --channel"
-        )
-    kept = np.array([not ours or name == ours[0] for name in channels], bool)
-    return Recorded(
-        np.array(time_s)[kept],
-        np.array(frame_ids, np.int32)[kept],
-        np.array(words, np.int64)[kept],
-        foreign + int(np.count_nonzero(~kept)),
-    )
-
-
-def _messages(path: Path) -> Iterator[can.Message]:
-    """All messages of a log. Raises RecordError."""
-    count = 0
-    failure = ""
-    with _quiet_asammdf() if path.suffix.lower() == ".mf4" else nullcontext():
-        try:
-            _refuse_cut_off(path)
-            with can.LogReader(str(path)) as reader:
-                for message in reader:
-                    yield message
-                    count += 1
-        except RecordError:
-            raise
-        except OSError as error:
-            failure = f"cannot be read: {error.strerror or error}"
-        except Exception as error:  # the readers and asammdf raise what they like
-            reason = " ".join(str(error).split()) or type(error).__name__
-            what = FORMATS[path.suffix.lower()]
-            where = f"damaged after frame {count}" if count else f"damaged, or not {what}"
-            failure = f"{where}: {reason}"
-    if failure:
-        raise RecordError(f"{path}: {failure}")
-
-
-@contextmanager
-def _quiet_asammdf() -> Iterator[None]:
-    """Keep asammdf from printing tracebacks of what it raises, also as it deletes its objects."""
-    logging.getLogger("asammdf").setLevel(logging.CRITICAL)
-    hook = sys.unraisablehook
-    sys.unraisablehook = lambda _: None
+    held = _Held()
+    missing = ""
     try:
-        yield
-    finally:
-        gc.collect()
-        sys.unraisablehook = hook
+        for row in formats.rows_of(path):
+            held.add(row)
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except formats.Refused as error:
+        raise RecordError(f"{path}: {error}") from None
+    except Incomplete as error:
+        missing = _missing(path, held.count, error)
+    if not held.count:
+        raise RecordError(f"{path}: {missing or 'holds no CAN frames'}")
+    announced = _announced(path)
+    if not missing and announced is not None and held.count < announced:
+        json = beside(path, "json").name
+        missing = f"cut off after frame {held.count}: {json} announces {announced}"
+    closed = not missing and held.count == announced
+    return held.on_channel(path, channel, missing, closed)
 
 
-def _refuse_cut_off(path: Path) -> None:
-    """Raise RecordError for a file that ends before its end: the readers take what is there."""
-    suffix = path.suffix.lower()
-    with open(path, "rb") as stream:
-        head = stream.read(24)
-        size = stream.seek(0, os.SEEK_END)
-        if size == 0:
-            raise RecordError(f"{path}: is empty")
-        if suffix == ".blf" and head.startswith(b"LOGG"):
-            (said,) = struct.unpack_from("<Q", head.ljust(24, b"\0"), 16)
-            if said > size:
-                raise RecordError(f"{path}: is cut off: {size} bytes of {said}")
-        if suffix == ".mf4":
-            if not head.startswith((b"MDF ", b"UnFinMF ")):
-                raise RecordError(f"{path}: is not {FORMATS[suffix]}")
-            if size < MDF_HEADER_BYTES:
-                raise RecordError(f"{path}: is cut off: {size} bytes")
-        if suffix in (".asc", ".log"):
-            stream.seek(-1, os.SEEK_END)
-            if stream.read(1) != b"\n":
-                raise RecordError(f"{path}: is cut off: its last line has no end")
+class _Held:
+    """The rows of a file, by columns: a tenth of what a tuple for each frame takes."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._time_s, self._frame_ids, self._words = array("d"), array("i"), array("q")
+        self._places = array("h")  # of channels
+        self._channels: dict[str, int] = {}
+        self._others: Counter[tuple[str, str]] = Counter()  # by channel and kind
+
+    def add(self, row: Row) -> None:
+        """A further frame. Raises Damaged."""
+        time_s, channel, kind, can_id, word = row
+        place = self._channels.setdefault(channel, len(self._channels))
+        if place == MOST_CHANNELS:
+            raise Damaged(f"frames on more than {MOST_CHANNELS} channels")
+        self.count += 1
+        if kind:
+            self._others[channel, kind] += 1
+            return
+        self._time_s.append(time_s)
+        self._frame_ids.append(can_id)
+        self._words.append(word)
+        self._places.append(place)
+
+    def on_channel(self, path: Path, channel: str | None, missing: str, closed: bool) -> Recorded:
+        """What is on a channel, by default on the one that has frames of the DBC, if any has.
+        Raises RecordError."""
+        frame_ids, places = np.array(self._frame_ids, np.int32), np.array(self._places)
+        if channel is not None and channel not in self._channels:
+            there = ", ".join(sorted(self._channels))
+            raise RecordError(f"{path}: holds no CAN frames on channel {channel!r}, but on {there}")
+        left_out: Counter[str] = Counter()
+        for (name, kind), count in self._others.items():
+            if channel in (None, name):
+                left_out[kind] += count
+        if channel is not None:
+            kept = places == self._channels[channel]
+        else:
+            ours = places[np.isin(frame_ids, list(INDEX_OF_FRAME_ID))]
+            names = sorted(name for name, place in self._channels.items() if (ours == place).any())
+            if len(names) > 1:
+                raise RecordError(
+                    f"{path}: channels {', '.join(names)} all carry frames of the DBC;"
+                    " name one with --channel"
+                )
+            kept = places == self._channels[names[0]] if names else np.ones(len(places), bool)
+            left_out["on other channels"] = int(np.count_nonzero(~kept))
+        return Recorded(
+            time_s=np.array(self._time_s)[kept],
+            frame_ids=frame_ids[kept],
+            words=np.array(self._words, np.int64)[kept],
+            left_out={kind: count for kind, count in left_out.items() if count},
+            missing=missing,
+            closed=closed,
+        )
+
+
+def _missing(path: Path, count: int, error: Incomplete) -> str:
+    """What of a file cannot be read, after `count` frames."""
+    cut = isinstance(error, CutOff)
+    if count:
+        return f"{'cut off' if cut else 'damaged'} after frame {count}: {error}"
+    what = formats.FORMATS[formats.suffix_of(path)].what
+    return f"{'is cut off' if cut else f'damaged, or not {what}'}: {error}"
+
+
+def _announced(path: Path) -> int | None:
+    """How many frames the session has left, as FILE.json says."""
+    try:
+        origin = load_origin(path)
+    except RecordError:  # `replay` says so, who needs it
+        return None
+    return origin.frames if origin is not None else None
 
 
 def runs_of(recorded: Recorded) -> list[RecordedRun]:
     """The runs in a recording: each lasts from RUN_CTRL(running) to one of another run or state."""
     edges: list[tuple[int, int]] = []  # first row, number
-    ends: list[int] = []
+    ends: list[tuple[int, bool]] = []  # row behind it, whether the run is said to have ended
     current: int | None = None
     for at, state, number in run_controls(recorded.frame_ids, recorded.words):
         if current is not None and (state != RUNNING or number != current):
-            ends.append(at)
+            ends.append((at, state == ENDED and number == current))
             current = None
         if current is None and state == RUNNING:
             edges.append((at, number))
             current = number
     if current is not None:
-        ends.append(len(recorded.words))
+        ends.append((len(recorded.words), False))
     runs = []
-    for (start, number), end in zip(edges, ends, strict=True):
+    for (start, number), (end, ended) in zip(edges, ends, strict=True):
         frames = np.empty(end - start, FRAME)
         frames["frame_id"] = recorded.frame_ids[start:end]
         frames["payload"] = recorded.words[start:end]
         frames["tick"] = ticks_of(frames["frame_id"])
         frames["tick"] += _first_tick(frames)
-        runs.append(RecordedRun(number, start, frames))
+        runs.append(RecordedRun(number, start, frames, ended))
     return runs
 
 

@@ -42,10 +42,13 @@ class Decoded:
     messages: list[str]
     foreign: int  # frames of other kinds or channels, left out
     unknown: int  # frames with identifiers that the DBC does not have, left out
+    notes: list[str]  # as Recorded.notes
+    missing: str  # what of the recording could not be read; the table has what comes before
 
 
 def decode(path: Path, out: Path, channel: str | None = None) -> Decoded:
-    """Write the frames of a recording that the DBC knows as a table, whole or not at all.
+    """Write the frames of a recording that the DBC knows as a table, whole or not at all. Of a
+    recording that is cut off or damaged, those before that.
 
     :param out: a name that ends in .csv or .parquet.
     :raises RecordError: the recording cannot be read, or the table cannot be written.
@@ -55,7 +58,8 @@ def decode(path: Path, out: Path, channel: str | None = None) -> Decoded:
     recorded = can_logs.read(path, channel)
     known = np.isin(recorded.frame_ids, list(INDEX_OF_FRAME_ID))
     if not known.any():
-        raise RecordError(f"{path}: holds no frame of the DBC")
+        cut = f"{recorded.missing}; " if recorded.missing else ""
+        raise RecordError(f"{path}: {cut}holds no frame of the DBC")
     run, tick = _places(recorded)
     present = set(recorded.frame_ids[known].tolist())
     messages = [message for message in MESSAGES if message.frame_id in present]
@@ -72,8 +76,14 @@ def decode(path: Path, out: Path, channel: str | None = None) -> Decoded:
         raise RecordError(f"{out}: cannot be written: {error.strerror or error}") from None
     finally:
         temporary.unlink(missing_ok=True)
-    names = [message.name for message in messages]
-    return Decoded(len(rows), names, recorded.foreign, int(np.count_nonzero(~known)))
+    return Decoded(
+        rows=len(rows),
+        messages=[message.name for message in messages],
+        foreign=recorded.foreign,
+        unknown=int(np.count_nonzero(~known)),
+        notes=recorded.notes(),
+        missing=recorded.missing,
+    )
 
 
 def _places(recorded: Recorded) -> tuple[np.ndarray, np.ndarray]:

@@ -30,7 +30,8 @@ from ato_hil.controller import node
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.process import Frame, answers, inbox_of
 from ato_hil.controller.registry import load_law
-from ato_hil.plant_sim.scenario import Loaded, load
+from ato_hil.plant_sim.scenario import Loaded, at_rate, load
+from ato_hil.plant_sim.world import run_ticks
 from ato_hil.tools.runs import can_logs, onboard
 from ato_hil.tools.runs.can_logs import Origin, RecordedRun, RecordError
 from ato_hil.tools.runs.frames import (
@@ -38,11 +39,13 @@ from ato_hil.tools.runs.frames import (
     ENDED,
     FRAME,
     multiplexed_by,
+    ticks_by_echo,
     timetable_rate,
 )
 from ato_hil.tools.session.recorder import lost_frames
 
 CONTROLLER = "CONTROLLER"  # the sender of the commands, in the DBC
+BOUNDS_OF_TICK = {message.frame_id: message for message in (TRAIN_POSITION, FORCE_CMD)}
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,7 @@ class Replay:
     memory_file: Path | None  # read, never written
     runs: list[RecordedRun]
     notes: list[str]  # what the user should know of the recording
+    missing: list[str]  # what the recording should hold and does not; empty if it is whole
 
 
 def prepare(
@@ -103,19 +107,68 @@ def prepare(
     if memory_file is not None and not memory_file.exists():
         raise RecordError(f"{memory_file}: there is no such learning memory")
     runs = can_logs.runs_of(recorded)
+    missing = [recorded.missing] if recorded.missing else []
     if not runs:
-        raise RecordError(f"{path}: holds no run: no RUN_CTRL says that one is running")
+        cut = f"{recorded.missing}; " if recorded.missing else ""
+        raise RecordError(f"{path}: {cut}holds no run: no RUN_CTRL says that one is running")
+    unfinished = [
+        text for run in runs if (text := _unfinished(loaded, origin, run, run is runs[-1]))
+    ]
+    if len(runs) > 1 and not runs[-1].ended and not _has_position(runs[-1]):
+        runs.pop()  # it was only announced
     for run in runs:
         _refuse_late_start(path, run)
-    notes = _notes(loaded, law, calibration, memory_file, runs, origin)
-    if recorded.foreign:
-        notes.append(f"{recorded.foreign} frames of other kinds or channels are left out")
-    return Replay(loaded, calibration, memory_file, runs, notes)
+    notes = _notes(loaded, law, calibration, memory_file, runs, origin) + recorded.notes()
+    if recorded.closed:  # the session ended there, and lost nothing
+        notes += unfinished
+    else:
+        missing += unfinished
+    return Replay(loaded, calibration, memory_file, runs, notes, missing)
+
+
+def _unfinished(loaded: Loaded, origin: Origin | None, run: RecordedRun, last: bool) -> str:
+    """Where a run ends before its end, if it does. A recording of ours has no RUN_CTRL(ended), so
+    a run is also whole if it has the control periods that it was to have."""
+    if run.ended:
+        return ""
+    planned = _planned_ticks(loaded, origin, run)
+    if planned is None:
+        unsaid = f"run {run.number} ends in tick {run.frames['tick'][-1]}, no RUN_CTRL says ended"
+        return unsaid if last else ""
+    bounds = run.frames[np.isin(run.frames["frame_id"], list(BOUNDS_OF_TICK))]
+    intact = [
+        e2e.check(word, -1, BOUNDS_OF_TICK[frame_id].data_id) == e2e.OK
+        for _tick, frame_id, word in bounds.tolist()
+    ]
+    bounds = bounds[np.array(intact, bool)]
+    _ticks, reached = ticks_by_echo(bounds["frame_id"], bounds["payload"], 0)
+    # In real time the run does not wait for the last command.
+    if reached >= planned - int(_in_real_time(run)):
+        return ""
+    return f"run {run.number} is not whole: it ends in tick {reached} of {planned}"
+
+
+def _planned_ticks(loaded: Loaded, origin: Origin | None, run: RecordedRun) -> int | None:
+    """Control periods that a run was to have, None if only the seed of the session would tell."""
+    lengths = loaded.scenario.run_length
+    if lengths is None:
+        return loaded.ticks
+    if lengths.reading == "stretched":
+        return at_rate(loaded, timetable_rate(run.frames)).ticks
+    return None if origin is None else run_ticks(loaded, origin.seed, run.number)
+
+
+def _in_real_time(run: RecordedRun) -> bool:
+    return bool(get(int(run.frames["payload"][0]), RUN_CTRL.Pace))  # a run begins with RUN_CTRL
+
+
+def _has_position(run: RecordedRun) -> bool:
+    return bool((run.frames["frame_id"] == TRAIN_POSITION.frame_id).any())
 
 
 def _refuse_late_start(path: Path, run: RecordedRun) -> None:
     """Raise RecordError if the recording begins inside the run."""
-    if not (run.frames["frame_id"] == TRAIN_POSITION.frame_id).any():
+    if not _has_position(run):
         raise RecordError(f"{path}: run {run.number} has no TRAIN_POSITION")
     tick = int(run.frames["tick"][0])
     if tick:

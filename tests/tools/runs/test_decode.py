@@ -127,7 +127,7 @@ def test_frames_outside_of_runs_have_no_run(tmp_path: Path) -> None:
     [
         (LOG, "x.txt", r"x.txt: expected a name that ends in .csv or .parquet"),
         (LOG, "no/x.csv", r"no/x.csv: cannot be written: "),
-        (LOG + "rubbish\n", "x.csv", r"dump.log: damaged after frame 6"),
+        ("rubbish\n" + LOG, "x.csv", r"dump.log: damaged, or not a log of candump -L: line 1: "),
         ("(1.0) can0 6FF#0011223344556677\n", "x.csv", r"dump.log: holds no frame of the DBC"),
     ],
 )
@@ -140,6 +140,16 @@ def test_bad_input_is_one_line_and_leaves_no_file(
         decode(log, tmp_path / out)
     assert "\n" not in str(failure.value)
     assert [path.name for path in tmp_path.iterdir()] == ["dump.log"]
+
+
+def test_of_a_damaged_recording_the_table_has_what_comes_before(tmp_path: Path) -> None:
+    log = tmp_path / "dump.log"
+    log.write_text(LOG + "rubbish\n" + LOG)
+    done = decode(log, tmp_path / "x.csv")
+    assert done.rows == 3
+    assert done.missing.startswith("damaged after frame 6: line 7: 'rubbish', expected (seconds)")
+    assert done.missing.endswith("; the 6 lines after it are not read")
+    assert len((tmp_path / "x.csv").read_text().splitlines()) == 1 + 3
 
 
 def test_a_table_that_cannot_be_written_whole_leaves_the_old_one(

@@ -121,8 +121,81 @@ def test_another_law_is_seen_at_once(recorded: Path) -> None:
 def test_a_recording_may_end_anywhere(recorded: Path, tmp_path: Path, lines: int) -> None:
     path = copy_of(recorded, tmp_path)
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-lines]))
-    results = list(replay(prepare(path)))
-    assert [each.difference for each in results] == [None, None]
+    prepared = prepare(path)
+    assert [each.difference for each in replay(prepared)] == [None, None]
+    frames = len(recorded.read_text().splitlines())
+    announced = f"cut off after frame {frames - lines}: short.log.json announces {frames}"
+    assert prepared.missing == [
+        announced,
+        f"run 2 is not whole: it ends in tick {TICKS - 1} of {TICKS}",
+    ]
+
+
+@pytest.mark.parametrize("suffix", ["log", "blf", "asc", "pcapng"])
+def test_a_recording_that_ends_inside_a_run_says_how_far_it_went(
+    recorded: Path, tmp_path: Path, suffix: str
+) -> None:
+    """Its logger was killed: the file is whole, as far as it goes, and no session has closed it."""
+    whole = can_logs.read(recorded)
+    path = tmp_path / f"alone.{suffix}"
+    frames = np.zeros(len(whole.words), FRAME)
+    frames["frame_id"], frames["payload"] = whole.frame_ids, whole.words
+    scenario = str(recorded.parent / "short.toml")
+    for kept, ends in ((len(frames), None), (9000, 1), (len(frames) - 9000, 2)):
+        with can_logs.Recording(path, 0.01) as recording:
+            recording.add(1, frames[:kept])
+        prepared = prepare(path, scenario)
+        results = list(replay(prepared))
+        assert [each.difference for each in results] == [None] * len(prepared.runs)
+        if ends is None:
+            assert prepared.missing == []
+        else:
+            (text,) = prepared.missing
+            ticks = results[-1].ticks
+            found = re.fullmatch(rf"run {ends} is not whole: it ends in tick (\d+) of 2001", text)
+            assert found is not None
+            assert ticks - 1 <= int(found[1]) <= ticks
+
+
+def test_a_run_that_its_session_cut_short_is_a_note(recorded: Path, tmp_path: Path) -> None:
+    path = copy_of(recorded, tmp_path)
+    run = can_logs.runs_of(can_logs.read(recorded))[0]
+    with can_logs.Recording(path, 0.01) as recording:
+        recording.add(1, run.frames[:5000])
+    prepared = prepare(path)
+    assert prepared.missing == []
+    (note,) = prepared.notes
+    assert note.startswith("run 1 is not whole: it ends in tick ")
+    assert [each.difference for each in replay(prepared)] == [None]
+
+
+def test_a_run_that_is_only_announced_is_not_replayed(recorded: Path, tmp_path: Path) -> None:
+    lines = recorded.read_text().splitlines(keepends=True)
+    second = can_logs.runs_of(can_logs.read(recorded))[1].start
+    path = tmp_path / "alone.log"
+    path.write_text("".join(lines[: second + 2]))
+    prepared = prepare(path, str(recorded.parent / "short.toml"))
+    assert [each.run for each in replay(prepared)] == [1]
+    assert prepared.missing == ["run 2 is not whole: it ends in tick 0 of 2001"]
+
+
+def test_the_command_says_what_is_missing_and_ends_as_a_session_that_ended_early(
+    ato_hil, recorded: Path, tmp_path: Path
+) -> None:
+    path = copy_of(recorded, tmp_path)
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:3000]) + "(0.1) can0 08")
+    again = ato_hil("replay", "short.log", cwd=tmp_path)
+    assert again.returncode == 3
+    assert "commands as recorded" in again.stdout
+    (line,) = again.stderr.splitlines()
+    says = r"ato-hil: short.log: cut off after frame 3000: its last line has no end; run 1 is not "
+    assert re.match(says + r"whole: it ends in tick \d+ of 2001", line)
+    table = ato_hil("decode", "short.log", "--out", "x.csv", cwd=tmp_path)
+    assert table.returncode == 3
+    assert table.stdout.startswith("x.csv: 3000 frames")
+    assert (
+        table.stderr == "ato-hil: short.log: cut off after frame 3000: its last line has no end\n"
+    )
 
 
 def test_the_learning_goes_on_where_it_began(record_session, tmp_path: Path) -> None:
@@ -174,7 +247,12 @@ def test_two_sessions_in_the_log_of_another_tool(recorded: Path, tmp_path: Path)
     assert [(each.run, each.difference) for each in replay(prepared)] == [
         (number, None) for number in (1, 2, 1, 2)
     ]
-    assert prepared.notes == ["16 frames of other kinds or channels are left out"]
+    assert prepared.notes == [
+        "16 frames of other kinds or channels are left out:"
+        " 4 extended, 4 error, 4 remote, 4 CAN FD",
+        "time goes back 4 times, first after frame 3001",
+    ]
+    assert prepared.missing == []
 
 
 def test_bad_input_is_one_line(recorded: Path, tmp_path: Path) -> None:
