@@ -39,8 +39,8 @@ and the handshake are in [bring-your-own-node.md](bring-your-own-node.md).
 COMMANDS_HEAD = """# Command line
 
 Every command of `ato-hil`; this page is made from the program (`make docs`), and
-`ato-hil COMMAND --help` says the same. Bad input gives one line and exit status 1; a run that ends
-early gives 3, Ctrl-C 130.
+`ato-hil COMMAND --help` says the same. Bad input gives one line and exit status 1; a run or
+a recording that ends early gives 3, Ctrl-C 130.
 """
 CLAIMS_BEGIN, CLAIMS_END = "<!-- claims: from ato-hil claims -->\n", "<!-- end of claims -->\n"
 

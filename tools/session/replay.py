@@ -111,9 +111,7 @@ def prepare(
     if not runs:
         cut = f"{recorded.missing}; " if recorded.missing else ""
         raise RecordError(f"{path}: {cut}holds no run: no RUN_CTRL says that one is running")
-    unfinished = [
-        text for run in runs if (text := _unfinished(loaded, origin, run, run is runs[-1]))
-    ]
+    unfinished = [text for run in runs if (text := _unfinished(loaded, origin, run))]
     if len(runs) > 1 and not runs[-1].ended and not _has_position(runs[-1]):
         runs.pop()  # it was only announced
     for run in runs:
@@ -126,15 +124,12 @@ def prepare(
     return Replay(loaded, calibration, memory_file, runs, notes, missing)
 
 
-def _unfinished(loaded: Loaded, origin: Origin | None, run: RecordedRun, last: bool) -> str:
+def _unfinished(loaded: Loaded, origin: Origin | None, run: RecordedRun) -> str:
     """Where a run ends before its end, if it does. A recording of ours has no RUN_CTRL(ended), so
     a run is also whole if it has the control periods that it was to have."""
     if run.ended:
         return ""
     planned = _planned_ticks(loaded, origin, run)
-    if planned is None:
-        unsaid = f"run {run.number} ends in tick {run.frames['tick'][-1]}, no RUN_CTRL says ended"
-        return unsaid if last else ""
     bounds = run.frames[np.isin(run.frames["frame_id"], list(BOUNDS_OF_TICK))]
     intact = [
         e2e.check(word, -1, BOUNDS_OF_TICK[frame_id].data_id) == e2e.OK
@@ -148,14 +143,20 @@ def _unfinished(loaded: Loaded, origin: Origin | None, run: RecordedRun, last: b
     return f"run {run.number} is not whole: it ends in tick {reached} of {planned}"
 
 
-def _planned_ticks(loaded: Loaded, origin: Origin | None, run: RecordedRun) -> int | None:
-    """Control periods that a run was to have, None if only the seed of the session would tell."""
+def _planned_ticks(loaded: Loaded, origin: Origin | None, run: RecordedRun) -> int:
+    """Control periods that a run was to have; the fewest that it may have had, if only the seed of
+    the session would tell."""
     lengths = loaded.scenario.run_length
     if lengths is None:
         return loaded.ticks
     if lengths.reading == "stretched":
         return at_rate(loaded, timetable_rate(run.frames)).ticks
-    return None if origin is None else run_ticks(loaded, origin.seed, run.number)
+    if origin is not None:
+        return run_ticks(loaded, origin.seed, run.number)
+    fewest_s = lengths.shortest_s
+    if run.number == 1 and lengths.first_s is not None:
+        fewest_s = lengths.first_s
+    return min(int(fewest_s / loaded.scenario.period_s + 0.5) + 1, loaded.ticks)
 
 
 def _in_real_time(run: RecordedRun) -> bool:
