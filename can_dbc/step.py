@@ -12,16 +12,24 @@ itself sees an edit of the compiled file only, not of what that file imports.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import inspect
 import operator
 import os
+import re
+import sys
 from functools import cache
 from pathlib import Path
+from pickle import loads
 from typing import Any
 
 import numba
-from numba.core.caching import FunctionCache
+from numba.core.caching import _Cache
+from numba.core.compiler import CompileResult
+from numba.core.serialize import dumps
+
+from ato_hil.can_dbc import cache as cache_files
 
 INTERPRETED = os.environ.get("ATO_HIL_INTERPRETED") == "1"
 # Each package and what it may import: a step compiles these sources in.
@@ -32,8 +40,22 @@ IMPORTS = {
     "tools": ("can_dbc", "controller", "plant_sim", "tools"),
 }
 
+# Settings of numba's (NUMBA_OPT, ...) that change the code, though not its results.
+CODE_SETTINGS = (
+    "OPT",
+    "BOUNDSCHECK",
+    "DEBUGINFO_DEFAULT",
+    "LOOP_VECTORIZE",
+    "SLP_VECTORIZE",
+    "ENABLE_PROFILING",
+)
+
 _INT64_MIN = -(2**63)
 _INT64_MAX = 2**63 - 1
+
+
+class StepError(ValueError):
+    """A step cannot be compiled here; one line."""
 
 
 class Checked(int):
@@ -115,14 +137,11 @@ def source_digest(package: str = "tools") -> str:
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=12).hexdigest()
 
 
-def cache_directory(package: str = "tools") -> Path:
-    """Where compiled steps of a package are kept: NUMBA_CACHE_DIR, else a folder a source digest
-    in the user's cache."""
-    configured = os.environ.get("NUMBA_CACHE_DIR")
-    if configured:
-        return Path(configured)
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "ato-hil" / source_digest(package)
+def cache_directory(package: str = "tools") -> Path | None:
+    """Where compiled steps of a package are kept, a folder for each source digest; None if there
+    is nowhere to write."""
+    root = cache_files.root()
+    return None if root is None else root / source_digest(package)
 
 
 def package_of(function: Any) -> str:
@@ -143,26 +162,87 @@ def _stable_identity(function: Any) -> str:
     return hashlib.blake2b("|".join(parts).encode(), digest_size=16).hexdigest()
 
 
-class _StepCache(FunctionCache):
-    """numba's, keyed by identity: numba keys a closure by its pickle, which has random parts where
-    the steps inside name a class made at run time, as the codec's messages are."""
+class _StepCache(_Cache):
+    """One file for each step and signature, keyed by identity: numba's own cache keys a closure by
+    its pickle, which has random parts where the steps inside name a class made at run time, as the
+    codec's messages are. It also trusts every file, and two processes that compile the same step
+    for two signatures can leave one's code under the other's."""
 
     def __init__(self, function: Any, identity: str) -> None:
-        super().__init__(function)
+        name = f"{function.__module__}.{function.__qualname__}"
+        self._name = re.sub(r"\W+", "_", name)[-100:]  # for people; the digest tells files apart
+        self._folder = cache_directory(package_of(function))
         self._identity = identity
 
-    def _index_key(self, signature: Any, codegen: Any) -> Any:
-        return signature, codegen.magic_tuple(), self._identity
+    @property
+    def cache_path(self) -> str | None:
+        return None if self._folder is None else str(self._folder)
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        target_context.refresh()  # must be done before code is loaded
+        path, key = self._place(signature, target_context.codegen())
+        if path is None:
+            return None
+        data = cache_files.load(path, key)
+        return None if data is None else CompileResult._rebuild(target_context, *loads(data))
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        path, key = self._place(signature, compiled.codegen)
+        if path is not None and not compiled.library.has_dynamic_globals:
+            cache_files.save(path, key, dumps(compiled._reduce()))
+
+    def _place(self, signature: Any, codegen: Any) -> tuple[Path | None, Any]:
+        """File and key of what is compiled for a signature, a processor and numba's settings."""
+        settings = tuple(str(getattr(numba.config, name)) for name in CODE_SETTINGS)
+        key = (
+            str(signature),
+            codegen.magic_tuple(),
+            self._identity,
+            settings,
+            sys.version_info[:2],
+        )
+        if self._folder is None:
+            return None, key
+        digest = hashlib.blake2b(repr(key).encode(), digest_size=12).hexdigest()
+        return self._folder / f"{self._name}.{digest}{cache_files.SUFFIX}", key
+
+    def enable(self) -> None: ...
+
+    def disable(self) -> None: ...
+
+    def flush(self) -> None: ...
+
+
+def require_compiler() -> None:
+    """Raises StepError where steps are neither compiled nor interpreted."""
+    if numba.config.DISABLE_JIT and not INTERPRETED:
+        raise StepError(
+            "NUMBA_DISABLE_JIT is set, and the steps need the compiler: unset it, or take"
+            " --mode mil, which interprets them"
+        )
+
+
+def _refusal(function: Any) -> Any:
+    """What stands for a step where numba is told not to compile."""
+
+    @functools.wraps(function)
+    def refuse(*_arguments: Any) -> None:
+        require_compiler()
+
+    refuse._uuid = _stable_identity(function)  # type: ignore[attr-defined]
+    return refuse
 
 
 def step(function: Any) -> Any:
-    """Compile `function` as an allocation-free step; in interpreted mode return it as it is."""
+    """Compile `function` as an allocation-free step; in interpreted mode return it as it is.
+
+    Where NUMBA_DISABLE_JIT is set, calling the step raises StepError.
+    """
     if INTERPRETED:
         return function
-    numba.config.CACHE_DIR = str(cache_directory(package_of(function)))
-    compiled = numba.njit(
-        nogil=True, error_model="numpy", cache=True, boundscheck=False, _nrt=False
-    )(function)
+    if numba.config.DISABLE_JIT:
+        return _refusal(function)
+    compiled = numba.njit(nogil=True, error_model="numpy", boundscheck=False, _nrt=False)(function)
     identity = _stable_identity(function)
     compiled._set_uuid(identity)
     compiled._cache = _StepCache(function, identity)

@@ -55,6 +55,7 @@ def test_a_user_without_privileges_runs_on_a_private_vcan(tmp_path, reference, s
     cache = tmp_path / "cache" / "ato-hil"
     for package in IMPORTS:
         compiled = cache_directory(package)
+        assert compiled is not None
         shutil.copytree(compiled, cache / compiled.name)
     (tmp_path / "runtime").mkdir(mode=0o700)
     subprocess.run(["chown", "-R", f"{NOBODY}:{NOBODY}", tmp_path], check=True)

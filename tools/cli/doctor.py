@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,29 +57,44 @@ def _compiler() -> Finding:
             "compiler", "broken", f"numba cannot compile here: {' '.join(str(error).split())[:200]}"
         )
     return Finding(
-        "compiler", "works" if right else "broken", f"numba {numba.__version__} compiled a step"
+        "compiler",
+        "works" if right else "broken",
+        f"numba {numba.__version__} compiled a step{_settings()}",
     )
+
+
+def _settings() -> str:
+    """What the environment tells the compiler: results stay, speed and output may not."""
+    changed = sorted(
+        name
+        for name in os.environ
+        if name.startswith("NUMBA_") and name not in ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
+    )
+    if not changed:
+        return ""
+    found = ", ".join(f"{name}={os.environ[name]}" for name in changed)
+    return f"; unset what slows it down or makes it print: {found}"
 
 
 def _cache() -> Finding:
-    from ato_hil.can_dbc.step import cache_directory
+    """Where compiled steps are, and which of them are damaged."""
+    from ato_hil.can_dbc import cache
 
-    folder = cache_directory()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        return Finding(
-            "compiler cache",
-            "broken",
-            f"{folder}: {error.strerror}; set NUMBA_CACHE_DIR to a folder that can be written",
-        )
-    return Finding(
-        "compiler cache",
-        "works",
-        f"{folder} can be written; the first run compiles, later ones load",
-    )
+    what = "compiler cache"
+    folder = cache.root()
+    if folder is None:
+        text = "no folder can be written, so each start compiles; set NUMBA_CACHE_DIR to one"
+        return Finding(what, "broken", text)
+    if reason := cache.why_not(folder):
+        return Finding(what, "broken", f"{folder}: {reason}; set NUMBA_CACHE_DIR to another")
+    texts = [f"{folder} can be written; the first run compiles, later ones load"]
+    if os.environ.get(cache.SHARED) == str(folder):
+        texts.append("the usual folder cannot be: give a home, or set NUMBA_CACHE_DIR")
+    if damaged := cache.damaged(folder):
+        names = ", ".join(str(path.relative_to(folder)) for path in damaged[:3])
+        more = f" and {len(damaged) - 3} more" if len(damaged) > 3 else ""
+        texts.append(f"damaged, will be compiled again: {names}{more}")
+    return Finding(what, "works", "; ".join(texts))
 
 
 def _dbc() -> Finding:

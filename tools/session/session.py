@@ -25,6 +25,8 @@ from ato_hil.can_dbc import faults
 from ato_hil.can_dbc.bus import choose_bus, open_bus, recv_frames
 from ato_hil.can_dbc.errors import InputError
 from ato_hil.controller import library, node, store
+from ato_hil.can_dbc.step import require_compiler
+from ato_hil.controller import node, store
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.interface import fault_names
 from ato_hil.controller.registry import is_file, load_law
@@ -150,6 +152,7 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     FaultError, SessionError for bad input, RunError if a run ends early (the summary then holds the
     runs that were completed and the reason), KeyboardInterrupt likewise.
     """
+    require_compiler()
     loaded = load(options.scenario)
     trains = members(loaded)
     if len(trains) > 1:

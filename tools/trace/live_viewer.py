@@ -19,6 +19,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from ato_hil.can_dbc.errors import InputError
+from ato_hil.can_dbc.cache import root
 
 LOOPBACK = "127.0.0.1"
 NATIVE, WEB = "native", "web"
@@ -150,8 +151,10 @@ def environment() -> dict[str, str]:
 
     Raises ViewerError if there is no such folder to be had.
     """
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(cache) / "ato-hil" / "viewer"
+    cache = root()
+    if cache is None:
+        raise ViewerError("no folder can be written for the settings of the viewer")
+    folder = cache / "viewer"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

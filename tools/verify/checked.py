@@ -21,6 +21,7 @@ import msgspec
 from numba.core import lowering, types
 from numba.core.imputils import lower_builtin, lower_cast
 
+from ato_hil.can_dbc.cache import SHARED
 from ato_hil.can_dbc.step import cache_directory
 from ato_hil.tools.verify import asked, identity
 from ato_hil.tools.verify.overflow import where
@@ -118,8 +119,8 @@ def whole_runs(law: str, scenarios: list[str]) -> WholeRuns:
 
 def ask(law: str, scenarios: list[str]) -> WholeRuns:
     """WholeRuns of a law in a process of its own."""
-    cache = cache_directory() / "checked"
-    environment = {"NUMBA_CACHE_DIR": str(cache)}
+    cache = cache_directory()
+    environment = {} if cache is None else {SHARED: str(cache / "checked")}
     return asked(WholeRuns, "ato_hil.tools.verify.checked", [law, *scenarios], environment)
 
 

@@ -16,6 +16,7 @@ import msgspec
 
 from ato_hil.can_dbc.bus import socketcan_reason
 from ato_hil.can_dbc.child import python
+from ato_hil.can_dbc.cache import SHARED
 from ato_hil.can_dbc.hub import DEFAULT_CHANNEL
 from ato_hil.controller.registry import is_file, load_law
 from ato_hil.plant_sim.scenario import (
@@ -199,7 +200,7 @@ def _digests(digests: set[str]) -> str:
 
 def variants(scratch: Path, buses: list[str]) -> list[Variant]:
     """The ways in which one run is repeated."""
-    cold = {"NUMBA_CACHE_DIR": str(scratch / "cache")}
+    cold = {SHARED: str(scratch / "cache")}
     return [
         Variant("another process", ("--mode", "sil", "--no-trace"), {"PYTHONHASHSEED": "1"}),
         Variant("other hash seed", ("--mode", "sil", "--no-trace"), {"PYTHONHASHSEED": "4242"}),
