@@ -16,7 +16,6 @@ from typing import Any
 
 from ato_hil.can_dbc.codec import choices
 from ato_hil.can_dbc.errors import InputError
-from ato_hil.controller import laws
 from ato_hil.controller import laws, subset
 
 PARTS = ("PARAMS", "STATE", "WORDS", "ESTIMATES", "Gains", "calibrate")  # of a law's module

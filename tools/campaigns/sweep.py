@@ -206,12 +206,25 @@ def plot(path: Path, loaded: Loaded, rows: list[dict[str, Any]], keys: list[str]
     What is varied last labels the points, what is varied before makes series of them.
     """
     import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    matplotlib.rcParams["svg.hashsalt"] = "ato-hil"  # the same file each time
-    from matplotlib import pyplot
+    from ato_hil.tools.papers.style import defaults
+    from ato_hil.tools.runs.files import write_bytes
 
-    figure, axes = pyplot.subplots(figsize=(7.5, 5.0), layout="constrained")
+    picture = io.BytesIO()
+    # The same file each time; what the user varies is no mathematics.
+    own = {"svg.hashsalt": "ato-hil", "text.parse_math": False}
+    with matplotlib.rc_context({**defaults(), **own}):
+        figure = Figure(figsize=(7.5, 5.0), layout="constrained")
+        _draw(figure, loaded, rows, keys)
+        kind = path.suffix[1:]
+        dated = {"Date": None} if kind == "svg" else {}
+        figure.savefig(picture, format=kind, dpi=130, metadata=dated)
+    write_bytes(path, picture.getvalue())
+
+
+def _draw(figure: Any, loaded: Loaded, rows: list[dict[str, Any]], keys: list[str]) -> None:
+    axes = figure.subplots()
     front = [rows[index] for index in pareto(rows)]
     axes.plot([r[ENERGY] for r in front], [r[ERROR] for r in front], "-", color="0.8", zorder=1)
     series: dict[str, list[dict[str, Any]]] = {}
@@ -240,5 +253,3 @@ def plot(path: Path, loaded: Loaded, rows: list[dict[str, Any]], keys: list[str]
     axes.grid(True, which="both", color="0.92")
     axes.set_axisbelow(True)
     axes.margins(x=0.12)
-    figure.savefig(path, dpi=130, metadata={"Date": None} if path.suffix == ".svg" else {})
-    pyplot.close(figure)

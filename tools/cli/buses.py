@@ -16,6 +16,7 @@ from ato_hil.tools.cli.console import (
     one_line_for_bad_input,
 )
 from ato_hil.tools.cli.options import Channel, LawName, Recording, ScenarioName
+from ato_hil.tools.cli.output import coloured
 
 if TYPE_CHECKING:
     from ato_hil.tools.reports.bus_report import Report as BusReport
@@ -47,7 +48,7 @@ def replay(
             soft_wrap=True,
         )
         for note in prepared.notes:
-            console.print(note, style="dim", soft_wrap=True, markup=False)
+            console.print(note, style="dim", soft_wrap=True)
         for result in open_loop.replay(prepared):
             if result.difference is not None:
                 where = f"run {result.run}, tick {result.difference.tick}"
@@ -69,14 +70,12 @@ def decode(
         from ato_hil.tools.runs import decode as tables
 
         done = tables.decode(recording, out, channel)
-    console.print(
-        f"{out}: {done.rows} frames, {len(done.messages)} messages", soft_wrap=True, markup=False
-    )
+    console.print(f"{out}: {done.rows} frames, {len(done.messages)} messages", soft_wrap=True)
     notes = list(done.notes)
     if done.unknown:
         notes.insert(0, f"{done.unknown} frames that the DBC does not have are left out")
     for note in notes:
-        console.print(note, style="dim", soft_wrap=True, markup=False)
+        console.print(note, style="dim", soft_wrap=True)
     if done.missing:
         raise fail(f"{recording}: {done.missing}", EXIT_ENDED_EARLY)
 
@@ -103,7 +102,7 @@ def bus_report(
         with console.status("finding out what is sent ..."):
             found = report(loaded, name, bitrate)
     if as_json:
-        typer.echo(json.dumps(found.as_json(), indent=1))
+        console.out(json.dumps(found.as_json(), indent=1), highlight=False)
     else:
         _print_bus_report(found)
     if found.complaints:
@@ -189,7 +188,7 @@ def doctor() -> None:
     table = Table("what", "state", "how it was checked, and what to do", header_style="bold")
     for finding in findings:
         colour = {"works": "green", "absent": "yellow", "broken": "red"}[finding.state]
-        table.add_row(finding.what, f"[{colour}]{finding.state}[/]", finding.text)
+        table.add_row(finding.what, coloured(finding.state, colour), finding.text)
     console.print(table)
     if any(finding.state == "broken" for finding in findings):
         raise typer.Exit(EXIT_BAD_INPUT)

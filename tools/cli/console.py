@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import signal
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import typer
-from rich.console import Console
 
 from ato_hil.can_dbc.errors import InputError
-
-# Where there is no terminal, tables are for files and pipes: wide enough not to wrap.
-console = Console(highlight=False, width=None if sys.stdout.isatty() else 150)
-errors = Console(stderr=True, highlight=False)
+from ato_hil.tools.cli.output import errors
 
 EXIT_BAD_INPUT = 1
 EXIT_ENDED_EARLY = 3  # a session, or a recording
@@ -23,7 +18,7 @@ EXIT_INTERRUPTED = 130
 
 def fail(message: str, code: int) -> typer.Exit:
     """Says why on one line; what it returns, raised, ends the command with that exit status."""
-    errors.print(f"ato-hil: {message}", style="red", soft_wrap=True, markup=False)
+    errors.print(f"ato-hil: {message}", style="red", soft_wrap=True)
     return typer.Exit(code)
 
 

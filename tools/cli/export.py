@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli.console import one_line_for_bad_input
+from ato_hil.tools.cli.console import console, one_line_for_bad_input
 
 app = typer.Typer(help="The firmware for other tools and targets.", no_args_is_help=True)
 
@@ -36,4 +36,6 @@ def c_command(
         made = folder.files(scenario, law)
         folder.write(made, out)
     lines = sum(text.count("\n") for text in made.values())
-    typer.echo(f"{out}: {len(made)} files, {lines} lines; the manual is {out / 'ato.h'}")
+    console.print(
+        f"{out}: {len(made)} files, {lines} lines; the manual is {out / 'ato.h'}", soft_wrap=True
+    )

@@ -62,7 +62,7 @@ def profile(
     lines = [",".join(["tick", *columns])]
     for tick, row in enumerate(zip(*columns.values(), strict=True)):
         lines.append(",".join([f"{tick}", *(f"{value:.7f}" for value in row)]))
-    typer.echo("\n".join(lines))
+    console.out("\n".join(lines), highlight=False)
 
 
 def view(

@@ -8,6 +8,7 @@ import typer
 
 from ato_hil.tools.cli import buses, compare, export, look, prove, run
 from ato_hil.tools.cli.options import Viewer
+from ato_hil.tools.cli.output import ignore_other_tools, streams
 
 app = typer.Typer(
     name="ato-hil",
@@ -43,7 +44,9 @@ def main() -> None:
         # `--view` alone is an option with a value that may be left out, which typer does not have.
         if word == "--view" and sys.argv[at + 1 : at + 2] not in (["web"], ["native"]):
             sys.argv[at] = f"--view={Viewer.native.value}"
-    app()
+    ignore_other_tools()
+    with streams():
+        app()
 
 
 if __name__ == "__main__":

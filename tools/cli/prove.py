@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table
 
 from ato_hil.tools.cli.console import (
@@ -20,6 +19,7 @@ from ato_hil.tools.cli.console import (
     sigterm_as_ctrl_c,
 )
 from ato_hil.tools.cli.options import Mode
+from ato_hil.tools.cli.output import coloured
 
 if TYPE_CHECKING:
     from ato_hil.tools.campaigns.threats import Campaign
@@ -57,7 +57,7 @@ def claims(
             row.paper,
             f"{row.threshold} {row.unit}".strip(),
             f"{row.measured:.4g} {row.unit}".strip(),
-            f"[{colour}]{verdict}[/]",
+            coloured(verdict, colour),
         )
     console.print(table)
     if json_file is not None:
@@ -83,14 +83,14 @@ def verify(
     with one_line_for_bad_input():
         if renew_golden:
             for line in identity.renew(laws or law_names()):
-                console.print(line, soft_wrap=True, markup=False)
+                console.print(line, soft_wrap=True)
             return
         with console.status("verifying") as status:
             for row in table.run(laws or [], fast):
                 rows.append(row)
                 if not console.is_terminal:
                     line = f"{row.state}: {row.name}, {row.subject}; {row.how}: {row.result}"
-                    console.print(line, soft_wrap=True, markup=False)
+                    console.print(line, soft_wrap=True)
                 status.update(f"{len(rows)} checks; last: {row.name}, {row.subject}")
     if console.is_terminal:
         _print_rows(rows)
@@ -103,8 +103,8 @@ def _print_rows(rows: list[Row]) -> None:
     shown = Table("property", "of", "how it was checked", "result", "", header_style="bold")
     for row in rows:
         colour = {"passed": "green", "absent": "yellow", "failed": "red"}[row.state]
-        cells = (escape(cell) for cell in (row.name, row.subject, row.how, row.result))
-        shown.add_row(*cells, f"[{colour}]{row.state}[/]")
+        state = coloured(row.state, colour)
+        shown.add_row(row.name, row.subject, row.how, row.result, state)
     console.print(shown)
 
 
@@ -261,7 +261,7 @@ def endurance(
             status.update(f"{len(done)} of {times} sessions; last: {outcome.cause}")
             for complaint in outcome.complaints:
                 text = f"trial {outcome.trial.number}: {complaint} ({outcome.cause})"
-                console.print(text, style="red", soft_wrap=True, markup=False)
+                console.print(text, style="red", soft_wrap=True)
             rows = [each.as_json() for each in done]
             files.write_json(out / "endurance.json", {"schema": 1, "seed": seed, "trials": rows})
     headings = ("node", "signal", "sessions", "named and clean", "longest to the end, s")

@@ -40,10 +40,11 @@ class Screen:
         self.title = ""
         self.faults = 0
         self.bar = Progress(
-            TextColumn("run {task.fields[run]} of {task.fields[last_run]}"),
+            TextColumn("run {task.fields[run]} of {task.fields[last_run]}", markup=False),
             BarColumn(),
             TextColumn(
-                "{task.percentage:>3.0f} %  {task.fields[rate]} ticks/s  {task.fields[last]}"
+                "{task.percentage:>3.0f} %  {task.fields[rate]} ticks/s  {task.fields[last]}",
+                markup=False,
             ),
             TimeElapsedColumn(),
             console=console,
@@ -66,7 +67,7 @@ class Screen:
 
     def note(self, text: str) -> None:
         """One line above the bar."""
-        self.bar.console.print(text, style="dim", soft_wrap=True, markup=False)
+        self.bar.console.print(text, style="dim", soft_wrap=True)
 
     def progress(self, run: int, tick: int) -> None:
         """Moves the bar."""

@@ -54,7 +54,7 @@ def figures(folders: list[Folder]) -> Iterator[Drawn]:
             )
     drawings: tuple[Drawing, ...] = papers.part(paper, "figures").FIGURES
     for drawing in drawings:
-        with matplotlib.rc_context(style.SETTINGS):
+        with matplotlib.rc_context(style.settings()):
             try:
                 yield Drawn(paper, drawing, drawing.draw(folders))
             except Missing as reason:

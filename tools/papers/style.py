@@ -65,6 +65,19 @@ SETTINGS: Any = {
     "ytick.labelsize": 7.5,
 }
 
+
+def defaults() -> Any:
+    """Matplotlib's own settings, without those of the user's matplotlibrc, which may ask for
+    LaTeX."""
+    own = matplotlib.rcParamsDefault
+    return {key: own[key] for key in own if not key.startswith("backend")}
+
+
+def settings() -> Any:
+    """How all figures look."""
+    return {**defaults(), **SETTINGS}
+
+
 DECADE = 8.0  # a span of values that asks for a logarithmic axis
 FEW_LABELS = 1000.0  # one that leaves room for the powers of ten alone
 
@@ -136,7 +149,12 @@ def over_runs(axes: Axes, *, decades: bool = False) -> None:
 
 
 def named(folders: Sequence[Folder], names: dict[str, str] | None = None) -> list[str]:
-    """What tells the folders apart: the law, else the scenario, else both, else the folder."""
+    """What tells the folders apart: the law, else the scenario, else both, else the folder. As a
+    label of Matplotlib's, to which a dollar sign means mathematics."""
+    return [text.replace("$", r"\$") for text in _told_apart(folders, names)]
+
+
+def _told_apart(folders: Sequence[Folder], names: dict[str, str] | None) -> list[str]:
     laws = [(names or {}).get(folder.law, folder.law) for folder in folders]
     scenarios = [folder.name for folder in folders]
     both = [f"{law}, {name}" for law, name in zip(laws, scenarios, strict=True)]
@@ -162,7 +180,7 @@ def lines_of(axes: Axes) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 def bytes_of(figure: Figure, kind: str, dots_per_inch: int = 150) -> bytes:
     """The picture as a file of FORMATS; the same bytes each time."""
     target = io.BytesIO()
-    with matplotlib.rc_context(SETTINGS):
+    with matplotlib.rc_context(settings()):
         figure.savefig(target, format=kind, dpi=dots_per_inch, metadata=METADATA[kind])
     return _few_colours(target) if kind == "png" else target.getvalue()
 

@@ -33,7 +33,7 @@ from can.io.mf4 import MF4Writer
 from ato_hil.can_dbc import e2e
 from ato_hil.can_dbc.codec import INDEX_OF_FRAME_ID, TRAIN_POSITION, get
 from ato_hil.can_dbc.errors import InputError
-from ato_hil.tools.runs import formats
+from ato_hil.tools.runs import files, formats
 from ato_hil.tools.runs.formats import pcapng
 from ato_hil.tools.runs.formats.common import (
     CutOff,
@@ -41,7 +41,6 @@ from ato_hil.tools.runs.formats.common import (
     Incomplete,
     Row,
 )
-from ato_hil.tools.runs import files
 from ato_hil.tools.runs.frames import (
     ENDED,
     FRAME,

@@ -24,9 +24,8 @@ import numpy as np
 from ato_hil.can_dbc import faults
 from ato_hil.can_dbc.bus import choose_bus, open_bus, recv_frames
 from ato_hil.can_dbc.errors import InputError
-from ato_hil.controller import library, node, store
 from ato_hil.can_dbc.step import require_compiler
-from ato_hil.controller import node, store
+from ato_hil.controller import library, node, store
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.interface import fault_names
 from ato_hil.controller.registry import is_file, load_law

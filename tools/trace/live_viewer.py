@@ -18,8 +18,8 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from urllib.parse import quote
 
-from ato_hil.can_dbc.errors import InputError
 from ato_hil.can_dbc.cache import root
+from ato_hil.can_dbc.errors import InputError
 
 LOOPBACK = "127.0.0.1"
 NATIVE, WEB = "native", "web"

@@ -27,6 +27,7 @@ Runs share the first two, so that a view that takes a plot of several runs overl
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -286,6 +287,7 @@ class TraceWriter:
             do, or fail to do, does not touch the file. It serves until `end_live`.
         :raises TraceError: the file cannot be written, or `cars` is out of range.
         """
+        os.environ.pop("RERUN", None)  # of other programs: "0" would leave us without a trace
         import rerun as rr  # costs a second and 100 MB: only who writes a trace pays for it
 
         if not 0 <= cars <= MAX_CARS:

@@ -15,8 +15,8 @@ from typing import Any
 import msgspec
 
 from ato_hil.can_dbc.bus import socketcan_reason
-from ato_hil.can_dbc.child import python
 from ato_hil.can_dbc.cache import SHARED
+from ato_hil.can_dbc.child import python
 from ato_hil.can_dbc.hub import DEFAULT_CHANNEL
 from ato_hil.controller.registry import is_file, load_law
 from ato_hil.plant_sim.scenario import (
