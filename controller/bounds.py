@@ -341,7 +341,7 @@ class _Frame:
     def _value(self, node: ast.expr, names: Names) -> Value:
         match node:
             case ast.Constant(value=int() as number):
-                return Int(int(number), int(number))
+                return self._in_64_bits(node, Int(int(number), int(number)))
             case ast.Name(id=name):
                 return self._named(node, name, names)
             case ast.Attribute(value=ast.Name(id=name), attr=attribute) if (
@@ -349,7 +349,9 @@ class _Frame:
             ):
                 held = getattr(self.names[name], attribute, None)
                 known = _constant(held, f"{name}.{attribute}")
-                return known if known is not None else self._add(node, "name")
+                if known is None:
+                    return self._add(node, "name")
+                return self._in_64_bits(node, known)
             case ast.Attribute(value=base, attr=attribute):
                 return self._field(node, self._value(base, names), attribute)
             case ast.Subscript(value=base, slice=index):
@@ -406,7 +408,7 @@ class _Frame:
         if name in self.names:
             known = _constant(self.names[name], name)
             if known is not None:
-                return known
+                return self._in_64_bits(node, known)
             return self._add(node, "name", f"{name} is no integer")
         if hasattr(builtins, name):
             return self._add(node, "name", f"{name} is no integer")
@@ -415,6 +417,13 @@ class _Frame:
         )
         hint = f"did you mean {close[0]}?" if close else ""
         return self._add(node, "name", f"{name} is not defined", hint)
+
+    def _in_64_bits(self, node: ast.expr, value: Value) -> Value:
+        """A constant, unless it is so large that the compiler takes it as unsigned."""
+        if isinstance(value, Int) and not (FULL.low <= value.low and value.high <= FULL.high):
+            what = f"{ast.unparse(node)} is outside 64 bits"
+            return self._add(node, "unsigned", what, "use constants below 2^63")
+        return value
 
     def _field(self, node: ast.Attribute, base: Value, name: str) -> Value:
         if base is UNKNOWN:
@@ -460,7 +469,7 @@ class _Frame:
         result = values[0] or UNKNOWN
         for other in values[1:]:
             result = _join(result, other or UNKNOWN)
-        return result
+        return self._in_64_bits(node, result)
 
     def _number(self, node: ast.AST, value: Value) -> Int | None:
         """The value as an integer; None, and a finding if there is none yet, if it is none."""
