@@ -222,7 +222,7 @@ def require_compiler() -> None:
         )
 
 
-def _refusal(function: Any) -> Any:
+def _uncompiled(function: Any) -> Any:
     """What stands for a step where numba is told not to compile."""
 
     @functools.wraps(function)
@@ -233,6 +233,22 @@ def _refusal(function: Any) -> Any:
     return refuse
 
 
+_PLACE = re.compile(r" at (/.+?\.py) \((\d+)\)")
+
+
+def refusal(error: Exception) -> str:
+    """One line for what the compiler says of a step that it refuses (a NumbaError): file and line
+    where the fault is, innermost and outside these packages if there is such a place, and why."""
+    text = str(error)
+    root = str(Path(__file__).resolve().parent.parent)
+    places = _PLACE.findall(text)
+    outside = [(file, line) for file, line in places if not file.startswith(f"{root}{os.sep}")]
+    where = "".join(f"{file}:{line}: " for file, line in (outside or places)[:1])
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    reasons = [line for line in lines if not line.startswith(("Failed in", "During: Pass"))]
+    return f"{where}the compiler refuses it: {(reasons or lines or ['no reason given'])[0]}"
+
+
 def step(function: Any) -> Any:
     """Compile `function` as an allocation-free step; in interpreted mode return it as it is.
 
@@ -241,7 +257,7 @@ def step(function: Any) -> Any:
     if INTERPRETED:
         return function
     if numba.config.DISABLE_JIT:
-        return _refusal(function)
+        return _uncompiled(function)
     compiled = numba.njit(nogil=True, error_model="numpy", boundscheck=False, _nrt=False)(function)
     identity = _stable_identity(function)
     compiled._set_uuid(identity)

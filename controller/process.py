@@ -23,6 +23,7 @@ from pathlib import Path
 
 import can
 import numpy as np
+from numba.core.errors import NumbaError
 
 from ato_hil.can_dbc import pace
 from ato_hil.can_dbc.bus import (
@@ -35,6 +36,7 @@ from ato_hil.can_dbc.child import Stop, follow_parent, tell
 from ato_hil.can_dbc.codec import RUN_CTRL, TRAIN_POSITION, get
 from ato_hil.can_dbc.faults import CONTROLLER, Receiver, receiver
 from ato_hil.can_dbc.inbox import Inbox, fresh_frames, intact
+from ato_hil.can_dbc.step import refusal
 from ato_hil.controller import calibration, node, store
 from ato_hil.controller.interface import ARMED, ENDED, RUNNING
 from ato_hil.controller.library import LibraryError
@@ -260,6 +262,9 @@ def main() -> int:
         BusError,
     ) as error:
         tell("error", message=str(error))
+        return 1
+    except NumbaError as error:
+        tell("error", message=refusal(error))
         return 1
     refused = [] if arguments.realtime is None else pace.prepare()
     tell(

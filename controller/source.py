@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # Rule: what a step may do, and what to write instead of what breaks it.
 RULES: dict[str, tuple[str, str]] = {
     "step": (
-        "the law and every function that it calls has `@step` of `ato_hil.can_dbc.step`, and nothing else,"
+        "the law and every function that it calls has `@step` of `ato_hil.law`, and nothing else,"
         " above its `def`",
         "write @step on the line above def",
     ),

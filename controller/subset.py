@@ -57,7 +57,7 @@ FLOATS = ("float", "round", "float16", "float32", "float64", "double")
 def check(modules: Sequence[ModuleType]) -> list[Finding]:
     """All findings in these modules, in the order of files and lines.
 
-    A module whose name ends as its law's step, in `ato_hil.controller.laws` or from a file, is a law. Steps
+    A module whose name ends as its law's step, in `controller/laws` or from a file, is a law. Steps
     of other modules that these call are taken as checked where they belong to the house, and
     checked along where they do not.
     """

@@ -3,6 +3,7 @@
 import json
 import operator
 import os
+import runpy
 import subprocess
 import sys
 from collections.abc import Callable
@@ -340,3 +341,32 @@ def test_the_cache_depends_on_the_dbc(tmp_path: Path) -> None:
     assert python(code) == python(code)
     assert python(code) != python(code, ATO_HIL_DBC=str(changed))
     assert python(code, ATO_HIL_DBC=str(tmp_path / "missing.dbc")) != python(code)
+
+
+# What the compiler refuses, in one line.
+
+
+@pytest.mark.parametrize(
+    ("body", "line", "reason"),
+    [
+        ("    return x.foo\n", 6, "Unknown attribute 'foo' of type int64"),
+        ("    y = [x]\n    return y[0]\n", 6, "NRT required but not enabled"),
+        ("    y = x if x > 0 else (x, x)\n    return y\n", 6, "Cannot unify"),
+    ],
+)
+def test_what_the_compiler_refuses_is_one_line_with_its_place(body, line, reason, tmp_path):
+    """Of the step where the fault is, not of the one that calls it."""
+    folder = tmp_path / "a folder"
+    folder.mkdir()
+    file = folder / "refused.py"
+    file.write_text(
+        "import numpy as np\nfrom ato_hil.can_dbc.step import step\n\n"
+        f"@step\ndef inner(x):\n{body}\n\n@step\ndef outer(x):\n    return inner(x)\n"
+    )
+    names = runpy.run_path(str(file))
+    with pytest.raises(NumbaError) as error:
+        names["outer"](1)
+    said = step_module.refusal(error.value)
+    assert said.startswith(f"{file}:{line}: the compiler refuses it: ")
+    assert reason in said
+    assert "\n" not in said

@@ -10,6 +10,7 @@ from ato_hil.plant_sim.scenario import Loaded, at_rate, members
 from ato_hil.tools.runs import onboard, summary_row
 from ato_hil.tools.runs.frames import timetable_rate
 from ato_hil.tools.session import sil
+from ato_hil.tools.session.session import prepare
 from ato_hil.tools.trace.writer import TraceWriter
 
 
@@ -24,10 +25,12 @@ def compare(
     """Rows of the first and the last learning run of each law (SIL); the trace overlays the last
     runs.
 
-    Raises ScenarioError or LawError for a law that is unknown or has no gains.
+    Raises ScenarioError or LawError for a law that is unknown or has no gains, before the folder of
+    `trace_file` is touched; SessionError if it cannot be written.
     """
     trains = members(loaded)
     controllers = {law: onboard.controllers_for(trains, law) for law in laws}
+    prepare(trace_file.parent)
     writer = TraceWriter(
         trace_file,
         title=f"{loaded.name}: {', '.join(laws)}",

@@ -213,7 +213,7 @@ def plot(path: Path, loaded: Loaded, rows: list[dict[str, Any]], keys: list[str]
 
     picture = io.BytesIO()
     # The same file each time; what the user varies is no mathematics.
-    own = {"svg.hashsalt": "ato-hil", "text.parse_math": False}
+    own: Any = {"svg.hashsalt": "ato-hil", "text.parse_math": False}
     with matplotlib.rc_context({**defaults(), **own}):
         figure = Figure(figsize=(7.5, 5.0), layout="constrained")
         _draw(figure, loaded, rows, keys)

@@ -8,15 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from ato_hil.tools.cli.console import (
-    EXIT_BAD_INPUT,
-    EXIT_ENDED_EARLY,
-    console,
-    fail,
-    one_line_for_bad_input,
-)
+from ato_hil.tools.cli.console import EXIT_BAD_INPUT, EXIT_ENDED_EARLY, fail, one_line_for_bad_input
 from ato_hil.tools.cli.options import Channel, LawName, Recording, ScenarioName
-from ato_hil.tools.cli.output import coloured
+from ato_hil.tools.cli.output import coloured, console
 
 if TYPE_CHECKING:
     from ato_hil.tools.reports.bus_report import Report as BusReport

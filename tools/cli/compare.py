@@ -9,8 +9,9 @@ import typer
 from rich.table import Table
 
 from ato_hil.tools.cli.columns import COMPARED, SWEPT, cell, faults_of
-from ato_hil.tools.cli.console import EXIT_INTERRUPTED, console, fail, one_line_for_bad_input
+from ato_hil.tools.cli.console import EXIT_INTERRUPTED, fail, one_line_for_bad_input
 from ato_hil.tools.cli.options import LawName, Runs, ScenarioName, Seed
+from ato_hil.tools.cli.output import console
 
 
 def compare(
@@ -31,11 +32,9 @@ def compare(
         from ato_hil.plant_sim.scenario import load
         from ato_hil.tools.campaigns import compare as side_by_side
         from ato_hil.tools.runs import files
-        from ato_hil.tools.session import session
 
         loaded = load(scenario)
         folder = out or Path("runs") / f"{loaded.folder_name}-compare"
-        session.prepare(folder)
         names = [law.strip() for law in laws.split(",") if law.strip()]
         with console.status("") as status:
             rows = side_by_side.compare(

@@ -24,11 +24,18 @@ def fail(message: str, code: int) -> typer.Exit:
 
 @contextmanager
 def one_line_for_bad_input() -> Iterator[None]:
-    """Bad input of every kind is one line and an exit status, no traceback."""
+    """Bad input of every kind is one line and an exit status, no traceback; so is a step that the
+    compiler refuses."""
     try:
         yield
     except InputError as error:
         raise fail(str(error), EXIT_BAD_INPUT) from None
+    except Exception as error:
+        if type(error).__module__ != "numba.core.errors":
+            raise
+        from ato_hil.can_dbc.step import refusal
+
+        raise fail(refusal(error), EXIT_BAD_INPUT) from None
 
 
 @contextmanager

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli.console import console, one_line_for_bad_input
+from ato_hil.tools.cli.console import one_line_for_bad_input
+from ato_hil.tools.cli.output import console
 
 app = typer.Typer(help="The firmware for other tools and targets.", no_args_is_help=True)
 

@@ -10,12 +10,12 @@ from rich.table import Table
 
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
-    console,
     fail,
     one_line_for_bad_input,
     sigterm_as_ctrl_c,
 )
 from ato_hil.tools.cli.options import Picture, ScenarioName
+from ato_hil.tools.cli.output import console
 
 
 def list_scenarios() -> None:

@@ -56,7 +56,7 @@ Recording = Annotated[
     Path,
     typer.Argument(
         metavar="FILE",
-        help="Recording: .blf, .asc, .log (candump -L), .pcapng, .mf4, or one with .gz behind that.",
+        help="Recording: .blf, .asc, .log (candump -L), .pcapng, .mf4, also with .gz behind it.",
     ),
 ]
 Channel = Annotated[str | None, typer.Option(help="The channel, if several carry our frames.")]

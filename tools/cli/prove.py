@@ -13,13 +13,12 @@ from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     EXIT_ENDED_EARLY,
     EXIT_INTERRUPTED,
-    console,
     fail,
     one_line_for_bad_input,
     sigterm_as_ctrl_c,
 )
 from ato_hil.tools.cli.options import Mode
-from ato_hil.tools.cli.output import coloured
+from ato_hil.tools.cli.output import coloured, console
 
 if TYPE_CHECKING:
     from ato_hil.tools.campaigns.threats import Campaign

@@ -18,12 +18,12 @@ from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     EXIT_ENDED_EARLY,
     EXIT_INTERRUPTED,
-    console,
     fail,
     one_line_for_bad_input,
     sigterm_as_ctrl_c,
 )
 from ato_hil.tools.cli.options import External, LawName, Mode, Pace, Runs, Seed, Viewer
+from ato_hil.tools.cli.output import console
 from ato_hil.tools.trace.live_viewer import LiveView
 
 if TYPE_CHECKING:

@@ -23,7 +23,8 @@ import numpy as np
 
 from ato_hil.can_dbc.codec import MAILBOX
 from ato_hil.controller import firmware as controller_firmware
-from ato_hil.controller import reference
+from ato_hil.controller import reference, tick_sources
+from ato_hil.controller.registry import law_step
 from ato_hil.plant_sim import (
     atp,
     plant,
@@ -44,7 +45,6 @@ from ato_hil.tools.export.translate import Program, resolved, settled_constants
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.frames import FRAME
 from ato_hil.tools.session import sil
-from ato_hil.tools.verify import subset
 
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 PLANT_MODULES = ("actuator", "atp", "brakes", "failures", "plant", "radio", "track")
@@ -70,7 +70,7 @@ class Loop:
         state = controller_firmware.state_dtype(module.STATE)
         plant_params = plant.params_dtype(model.PARAMS)
         plant_state = plant.state_dtype(model.STATE)
-        modules = subset.linted_modules([law])
+        modules = tick_sources.modules_of([law])
         modules += [importlib.import_module(f"plant_sim.{name}") for name in PLANT_MODULES]
         modules += [
             importlib.import_module(f"ato_hil.plant_sim.trains.{found.name}")
@@ -90,9 +90,9 @@ class Loop:
             },
         )
         self.program = Program(self.records.name)
-        law_step = firmware.law_step(module)
+        step = law_step(module)
         _, sense, act = plant.build(model)
-        tick = controller_firmware.build_tick(law_step)
+        tick = controller_firmware.build_tick(step)
         limits = Fields(
             "ato_limits",
             tuple(

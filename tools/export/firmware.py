@@ -25,6 +25,8 @@ from ato_hil.controller import (
     library,
     memory,
     reference,
+    subset,
+    tick_sources,
 )
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.registry import law_label, law_step, load_law
@@ -47,7 +49,6 @@ from ato_hil.tools.export.translate import (
     signals_of,
     wrapped,
 )
-from ato_hil.tools.verify import subset
 
 HERE = Path(__file__).parent
 # What the header needs of the interface, by the name that it has there.
@@ -83,7 +84,7 @@ class Translated:
         self.firmware = made
         law = made.law
         refuse(made.first.law)
-        self.modules = subset.linted_modules([made.first.law])
+        self.modules = tick_sources.modules_of([made.first.law])
         params, state = firmware.params_dtype(law.PARAMS), firmware.state_dtype(law.STATE)
         self.records = Records(self.modules, {"ato_params": params, "ato_state": state})
         self.program = Program(self.records.name)
@@ -117,7 +118,7 @@ class Translated:
 
 def refuse(law: str) -> None:
     """Raises ExportError with the linter's line if a step breaks a rule of the portable subset."""
-    for finding in subset.check(subset.linted_modules([law])):
+    for finding in subset.check(tick_sources.modules_of([law])):
         raise ExportError(str(finding))
 
 
@@ -365,7 +366,7 @@ def header_file(made: Translated) -> str:
         f"#define ATO_CELLS {cells} /* of the learning memory */",
         f"#define ATO_WORDS {words} /* a cell */",
         "",
-        "/* Run states, in RUN_CTRL and ATO_STATUS, and the faults that leave no trace in the memory. */",
+        "/* Run states, in RUN_CTRL and ATO_STATUS, and faults that leave no trace in the memory. */",
         *(f"#define ATO_{name} {getattr(interface, name)}" for name in PUBLIC),
         "",
         f"typedef int{width}_t ato_word; /* of the learning memory */",
@@ -393,12 +394,12 @@ def header_file(made: Translated) -> str:
         "",
         "extern const ato_information ATO_INFORMATION;",
         "",
-        "/* Once, when power comes on: no run, the learning memory as before the first one. To go on",
-        " * with what was learned, copy it into cells[state->memory.generation] after that. */",
+        "/* Once, when power comes on: no run, the learning memory as before the first one. To go",
+        " * on with what was learned, copy it into cells[state->memory.generation] after that. */",
         "void ato_init(const ato_params *params, ato_state *state, ato_word *cells);",
         "",
-        "/* Once a control period (period 1), and when RUN_CTRL arms or ends a run (period 0). 1 if a",
-        " * run has ended here: now is the time to store cells[state->memory.generation]. */",
+        "/* Once a control period (period 1), and when RUN_CTRL arms or ends a run (period 0). 1 if",
+        " * a run has ended here: now is the time to store cells[state->memory.generation]. */",
         "int64_t ato_cycle(const ato_params *params, const ato_segment *profile, ato_state *state,",
         "    ato_word *cells, const ato_mailbox *rx, ato_mailbox *tx, int64_t period);",
         "",
@@ -430,8 +431,8 @@ MANUAL = """The automatic train operation of one train as C99: frames in, frames
 period of {period_ms} ms.
 
 Memory: the caller owns it all. One ato_state ({state} bytes) and one learning memory
-ato_word[2 * ATO_CELLS * ATO_WORDS] ({cells} bytes) for each train, a generation after the other; the parameters ({params} bytes)
-and the timetable are constants. Nothing is allocated, nothing static is written, no floating
+ato_word[2 * ATO_CELLS * ATO_WORDS] ({cells} bytes) for each train, a generation after the other;
+the parameters ({params} bytes) and the timetable are constants. Nothing is allocated, nothing static is written, no floating
 point, no recursion. Several trains, or threads, may run side by side, each on its own state.
 
 Order of calls:

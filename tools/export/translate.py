@@ -22,6 +22,7 @@ import numba
 import numpy as np
 
 from ato_hil.can_dbc.step import int64
+from ato_hil.controller.subset import C_KEYWORDS
 from ato_hil.tools.export import ExportError
 from ato_hil.tools.export.kinds import (
     AND,
@@ -63,7 +64,6 @@ from ato_hil.tools.export.source import (
     source_of,
     step_of,
 )
-from ato_hil.tools.verify.subset import C_KEYWORDS
 
 WIDTH = 100
 BARE = ("q", "codec")  # modules whose steps are named without them
@@ -589,7 +589,7 @@ class _Body:
                 self._put("return;")
             case ast.Return(value=ast.Constant(value=None)):
                 self._put("return;")
-            case ast.Return(value=value):
+            case ast.Return(value=ast.expr() as value):
                 self._return(node, value)
             case ast.If():
                 self._if(node, "")
@@ -718,7 +718,7 @@ class _Body:
     def _return(self, node: ast.stmt, value: ast.expr) -> None:
         if isinstance(value, ast.Tuple):
             parts = [self._expression(one) for one in value.elts]
-            kind: Kind = Several(tuple(part.kind for part in parts))
+            kind = Several(tuple(part.kind for part in parts))
             text = f"({self.program.several_name(kind)}){{{', '.join(p.text for p in parts)}}}"
             made = Expression(text, kind)
         else:

@@ -2,7 +2,7 @@
 
 A recording holds the frames that the digest stands for, those of the runs, in bus order. Their
 time is that of the simulation: it starts at 0 and goes on from run to run, so that SIL and HIL
-leave the same recording. The suffix of a file says its format: `ato_hil.tools.runs.formats` reads all of them,
+leave the same recording. The suffix of a file says its format: `formats` reads all of them,
 python-can writes all but pcapng.
 
 Beside FILE lies FILE.json, what `ato-hil replay` has to know of the session, and FILE.memory if

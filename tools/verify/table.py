@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from ato_hil.can_dbc.step import INTERPRETED
+from ato_hil.controller import tick_sources
 from ato_hil.controller.registry import law_names, load_law
 from ato_hil.controller.source import RULES, steps_of
 from ato_hil.controller.subset import check
@@ -23,7 +24,6 @@ from ato_hil.tools.verify import (
     native,
     overflow,
     row,
-    subset,
 )
 
 SHORT_TICKS = 1200
@@ -74,7 +74,7 @@ def _checks(laws: list[str], fast: bool) -> Iterator[Row]:
 
 def check_subset(laws: list[str]) -> Row:
     """The linter over the shared modules and these laws."""
-    modules = subset.linted_modules(laws)
+    modules = tick_sources.modules_of(laws)
     found = check(modules)
     steps = sum(len(steps_of(module)) for module in modules)
     text = (
@@ -91,7 +91,7 @@ def check_subset(laws: list[str]) -> Row:
 
 def check_reach() -> Row:
     """That the gates on the ticks see every step."""
-    missed = subset.unreached(law_names())
+    missed = tick_sources.unreached(law_names())
     how = "calls, from the tick around each law"
     text = ", ".join(missed) or "every step is part of a tick, whose code is checked whole"
     return row("integers only", "all steps", how, text, not missed)

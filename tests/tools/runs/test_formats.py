@@ -13,6 +13,7 @@ import subprocess
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -42,7 +43,7 @@ def messages() -> list[can.Message]:
 
 def strangers() -> list[can.Message]:
     """A frame of each kind that is not ours, as python-can knows them."""
-    common = {"timestamp": 99.0, "channel": 0}
+    common: Any = {"timestamp": 99.0, "channel": 0}
     return [
         can.Message(arbitration_id=0x90, is_extended_id=True, data=bytes(8), **common),
         can.Message(arbitration_id=0x90, is_extended_id=False, is_remote_frame=True, **common),
@@ -222,7 +223,7 @@ def test_a_file_of_another_kind_is_named(tmp_path: Path) -> None:
         (b";$FILEVERSION=2.1\n", "is a PEAK trace"),
         (b"", "is empty"),
     ):
-        assert says in read_or_refusal(tmp_path / "other.log", content)
+        assert says in str(read_or_refusal(tmp_path / "other.log", content))
 
 
 # Time

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ato_hil.can_dbc.step import step
-from ato_hil.controller import registry, source
+from ato_hil.controller import registry, source, tick_sources
 from ato_hil.controller.subset import check
 from ato_hil.tools.verify import (
     FAILED,
@@ -25,7 +25,6 @@ from ato_hil.tools.verify import (
     ir,
     native,
     overflow,
-    subset,
     table,
 )
 
@@ -109,7 +108,7 @@ def test_a_finding_names_file_line_and_rule(tmp_path):
 
 
 def test_every_step_of_the_house_keeps_the_subset():
-    modules = subset.linted_modules(registry.law_names())
+    modules = tick_sources.modules_of(registry.law_names())
     assert sum(len(source.steps_of(module)) for module in modules) > 30
     assert check(modules) == []
 
@@ -122,8 +121,8 @@ def test_a_law_alone_keeps_the_subset(law):
 
 def test_the_gates_on_the_ticks_see_every_step():
     assert table.check_reach().state == PASSED
-    assert "ato_hil.controller.q.sin_half_pi" in subset.unreached(["pid"])
-    assert "ato_hil.controller.q.sin_half_pi" not in subset.unreached(["cailc"])
+    assert "ato_hil.controller.q.sin_half_pi" in tick_sources.unreached(["pid"])
+    assert "ato_hil.controller.q.sin_half_pi" not in tick_sources.unreached(["cailc"])
 
 
 # The machine's view.

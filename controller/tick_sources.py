@@ -1,5 +1,5 @@
-"""The portable subset over everything that a law's tick is made of: `controller/subset.py` on the
-shared modules and the laws, and that the ticks reach every step."""
+"""The sources that a law's tick is made of: what the linter reads, what becomes C, and which of
+their steps the ticks reach."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SHARED_MODULES = (
 )
 
 
-def linted_modules(laws: list[str]) -> list[ModuleType]:
+def modules_of(laws: list[str]) -> list[ModuleType]:
     """The shared modules, the modules of these laws, and those of the laws that they build on."""
     found = [importlib.import_module(name) for name in SHARED_MODULES]
     found += [registry.load_law(name) for name in laws]
@@ -43,8 +43,8 @@ def linted_modules(laws: list[str]) -> list[ModuleType]:
 
 
 def unreached(laws: list[str]) -> list[str]:
-    """Steps of the linted modules that the tick around none of these laws reaches."""
-    modules = linted_modules(laws)
+    """Steps of these modules that the tick around none of these laws reaches."""
+    modules = modules_of(laws)
     steps = {step.key: step for module in modules for step in steps_of(module)}
     graph = calls(steps)
     ahead = [("ato_hil.controller.firmware", "tick")]
