@@ -18,8 +18,7 @@ import numpy as np
 from ato_hil.can_dbc.bus import choose_bus, open_bus
 from ato_hil.can_dbc.child import python
 from ato_hil.plant_sim.scenario import load
-from ato_hil.tools.runs import onboard
-from ato_hil.tools.session import session, sil
+from ato_hil.tools.session import in_process, session
 from ato_hil.tools.trace import live_viewer
 
 SCENARIO = "subway-fast"
@@ -84,11 +83,7 @@ def watched_rates(bus: str) -> tuple[float, float]:
 def sil_rate() -> float:
     """Median rate of five runs of the lumped subway train, ticks/s."""
     loaded = load(SCENARIO)
-    calibration = onboard.calibration_for(loaded, "cailc")
-    rates = [
-        loaded.ticks / result.seconds
-        for result, _node in sil.run(loaded, calibration, runs=range(1, 6), seed=1)
-    ]
+    rates = [loaded.ticks / run.seconds for run in in_process.runs(loaded, "cailc", 5)]
     return float(np.median(rates))
 
 

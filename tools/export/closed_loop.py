@@ -260,5 +260,5 @@ def run(loaded: Loaded, law: str, runs: range, seed: int) -> Iterator[tuple[list
             seconds = time.perf_counter() - started
 
         nodes = onboard.controllers_for(members(loaded), law)
-        for results in sil.run_line(loaded, nodes, runs=runs, seed=seed, loop=loop):
-            yield [r.frames for r in results], seconds, len(results[0].truth)
+        for run in sil.run_line(loaded, nodes, runs=runs, seed=seed, loop=loop):
+            yield run.frames, seconds, run.ticks

@@ -366,7 +366,7 @@ def header_file(made: Translated) -> str:
         f"#define ATO_CELLS {cells} /* of the learning memory */",
         f"#define ATO_WORDS {words} /* a cell */",
         "",
-        "/* Run states, in RUN_CTRL and ATO_STATUS, and faults that leave no trace in the memory. */",
+        "/* Run states, of RUN_CTRL and ATO_STATUS; faults that leave no trace in the memory. */",
         *(f"#define ATO_{name} {getattr(interface, name)}" for name in PUBLIC),
         "",
         f"typedef int{width}_t ato_word; /* of the learning memory */",
@@ -398,8 +398,8 @@ def header_file(made: Translated) -> str:
         " * on with what was learned, copy it into cells[state->memory.generation] after that. */",
         "void ato_init(const ato_params *params, ato_state *state, ato_word *cells);",
         "",
-        "/* Once a control period (period 1), and when RUN_CTRL arms or ends a run (period 0). 1 if",
-        " * a run has ended here: now is the time to store cells[state->memory.generation]. */",
+        "/* Once a control period (period 1), and when RUN_CTRL arms or ends a run (period 0). 1",
+        " * if a run has ended here: now is the time to store cells[state->memory.generation]. */",
         "int64_t ato_cycle(const ato_params *params, const ato_segment *profile, ato_state *state,",
         "    ato_word *cells, const ato_mailbox *rx, ato_mailbox *tx, int64_t period);",
         "",
@@ -432,8 +432,8 @@ period of {period_ms} ms.
 
 Memory: the caller owns it all. One ato_state ({state} bytes) and one learning memory
 ato_word[2 * ATO_CELLS * ATO_WORDS] ({cells} bytes) for each train, a generation after the other;
-the parameters ({params} bytes) and the timetable are constants. Nothing is allocated, nothing static is written, no floating
-point, no recursion. Several trains, or threads, may run side by side, each on its own state.
+the parameters ({params} bytes) and the timetable are constants. Nothing is allocated, nothing
+static is written, no floating point, no recursion. Several trains, or threads, may run side by side, each on its own state.
 
 Order of calls:
 

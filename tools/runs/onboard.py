@@ -23,6 +23,8 @@ from ato_hil.plant_sim.scenario import Loaded, Scenario, ScenarioError
 from ato_hil.plant_sim.trains import point
 from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
+EXTERNAL_LAW = "external"  # of a controller that is not ours
+
 
 def calibration_for(loaded: Loaded, law: str) -> Calibration:
     """What the controller is flashed with for one law. Raises ScenarioError with file and key.
@@ -117,6 +119,12 @@ def _settings(key: str, values: dict[str, Any], kind: Any) -> Any:
         return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
         raise CalibrationError(f"{key}: {error}") from None
+
+
+def cars(loaded: Loaded) -> int:
+    """How many cars get a force of their own."""
+    scenario = loaded.scenario
+    return len(scenario.train.effectiveness) if scenario.control.distribute else 0
 
 
 def run_numbers(law: str, runs: int, learned: int = -1) -> range:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +16,11 @@ import numpy as np
 from ato_hil.can_dbc.codec import MESSAGE_COUNT, MESSAGES
 from ato_hil.can_dbc.step import step
 from ato_hil.controller import node as controller_node
-from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.interface import fault_names
 from ato_hil.plant_sim import plant, world
-from ato_hil.plant_sim.scenario import Loaded
+from ato_hil.plant_sim.scenario import Loaded, members
 from ato_hil.tools.runs.frames import FRAME
-from ato_hil.tools.runs.result import RunResult
+from ato_hil.tools.runs.result import Run, Runs
 
 FRAME_IDS = np.array([message.frame_id for message in MESSAGES], np.int32)
 
@@ -93,34 +91,6 @@ def build_loop(controller_tick: Any, sense: Any, actuate_and_advance: Any) -> An
     return loop
 
 
-def run(
-    loaded: Loaded,
-    calibration: Calibration,
-    *,
-    runs: range,
-    seed: int,
-    memory_file: Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> Iterator[tuple[RunResult, controller_node.Controller]]:
-    """The runs of a single train numbered `runs`, one after the other; `progress(run, tick)` is
-    called as they go."""
-    node = controller_node.build(calibration, memory_file)
-    yield from run_controller(loaded, node, runs=runs, seed=seed, progress=progress)
-
-
-def run_controller(
-    loaded: Loaded,
-    node: controller_node.Controller,
-    *,
-    runs: range,
-    seed: int,
-    progress: Callable[[int, int], None] | None = None,
-) -> Iterator[tuple[RunResult, controller_node.Controller]]:
-    """The same with a controller that the caller has built."""
-    for (result,) in run_line(loaded, [node], runs=runs, seed=seed, progress=progress):
-        yield result, node
-
-
 def run_line(
     loaded: Loaded,
     nodes: list[controller_node.Controller],
@@ -129,10 +99,12 @@ def run_line(
     seed: int,
     progress: Callable[[int, int], None] | None = None,
     loop: Any = None,
-) -> Iterator[list[RunResult]]:
-    """The runs of all trains, with a controller for each in `nodes`; a result for each. `loop` is
-    another one than that of `build_loop`, with the same arguments."""
+) -> Iterator[Run]:
+    """The runs numbered `runs`, one after the other, of all trains, with a controller for each in
+    `nodes`; `progress(run, tick)` is called as they go; `loop` is another one than that of
+    `build_loop`, with the same arguments."""
     here = world.build(loaded, seed)
+    made = Runs(members(loaded), nodes[0].calibration.law)
     params, state, cells = _put_side_by_side(nodes, here)
     loop = loop or build_loop(nodes[0].tick, here.sense, here.actuate_and_advance)
     trains = len(nodes)
@@ -178,10 +150,8 @@ def run_line(
         _announce(here, nodes, plant.ENDED, number)
         if progress:
             progress(number, ticks)
-        yield [
-            RunResult(number, frames[train][: counts[train]], truth[train], faults[train], seconds)
-            for train in range(trains)
-        ]
+        sent = [of_train[:count] for of_train, count in zip(frames, counts, strict=True)]
+        yield made.add(number, sent, list(truth), faults, seconds)
 
 
 def _put_side_by_side(

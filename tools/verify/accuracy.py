@@ -25,7 +25,7 @@ from ato_hil.plant_sim import world
 from ato_hil.plant_sim.scenario import Loaded, load, members
 from ato_hil.tools.papers.reference import Reference, references
 from ato_hil.tools.runs import onboard
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 from ato_hil.tools.verify import (
     ABSENT,
     FAILED,
@@ -148,8 +148,8 @@ def _runs(
     pairs = [_pair(module, reference, train, law, drive, ticks) for train in members(loaded)]
     truth = []
     kept = [pair.state["law"]["real"]["memory"].copy() for pair in pairs]
-    for results in sil.run_line(loaded, pairs, runs=numbers, seed=identity.SEED):
-        truth.append(np.stack([result.truth for result in results]))
+    for run in in_process.drive(loaded, pairs, numbers, identity.SEED):
+        truth.append(np.stack(run.truths))
         for train, pair in enumerate(pairs):
             # As the firmware does: a run with a fault leaves no trace in what is learned.
             if int(pair.state["core"]["faults"][0]) & FAULTS_THAT_BLOCK_LEARNING:

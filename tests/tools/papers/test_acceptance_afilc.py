@@ -35,7 +35,7 @@ from ato_hil.tools.papers.afilc.claims import (
 )
 from ato_hil.tools.papers.claims import variant
 from ato_hil.tools.runs import onboard
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 
 STRETCHED = "crh3-learning-stretched"
 LIT, LITT, MIN, REV = (
@@ -110,12 +110,11 @@ def test_ticks_that_a_run_does_not_reach_keep_what_they_have(decimation):
     loaded = variant(REV, IDEAL + grid(0, decimation))
     before = None
     cut = 0
-    for result, made in sil.run(
-        loaded, onboard.calibration_for(loaded, "afilc"), runs=range(1, 5), seed=1
-    ):
+    (made,) = onboard.controllers_for([loaded], "afilc")
+    for run in in_process.drive(loaded, [made], range(1, 5), 1):
         after = made.cells[int(made.state[0]["memory"]["generation"])].copy()
-        reached = -(-len(result.truth) // decimation)
-        assert not result.faults
+        reached = -(-run.ticks // decimation)
+        assert run.faults == [[]]
         if before is not None:
             assert (after[reached:] == before[reached:]).all()
             assert (after[reached - 1] != before[reached - 1]).any()
