@@ -433,7 +433,8 @@ period of {period_ms} ms.
 Memory: the caller owns it all. One ato_state ({state} bytes) and one learning memory
 ato_word[2 * ATO_CELLS * ATO_WORDS] ({cells} bytes) for each train, a generation after the other;
 the parameters ({params} bytes) and the timetable are constants. Nothing is allocated, nothing
-static is written, no floating point, no recursion. Several trains, or threads, may run side by side, each on its own state.
+static is written, no floating point, no recursion. Several trains, or threads, may run side by
+side, each on its own state.
 
 Order of calls:
 
