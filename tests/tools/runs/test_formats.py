@@ -43,7 +43,7 @@ def messages() -> list[can.Message]:
 
 def strangers() -> list[can.Message]:
     """A frame of each kind that is not ours, as python-can knows them."""
-    common: Any = {"timestamp": 99.0, "channel": 0}
+    common: dict[str, Any] = {"timestamp": 99.0, "channel": 0}
     return [
         can.Message(arbitration_id=0x90, is_extended_id=True, data=bytes(8), **common),
         can.Message(arbitration_id=0x90, is_extended_id=False, is_remote_frame=True, **common),
@@ -148,7 +148,6 @@ def test_frames_of_other_kinds_are_counted(tmp_path: Path) -> None:
         path = tmp_path / f"mixed.{suffix}"
         with_writer(path, messages() + strangers())
         found = can_logs.read(path)
-        # candump's error frames are on a channel of python-can's own.
         assert found.left_out == counted, suffix
         assert (found.missing, found.words.tolist()) == ("", WORDS)
         (note,) = found.notes()
@@ -443,6 +442,11 @@ def test_a_line_that_is_no_event_is_damage(tmp_path: Path, line: str) -> None:
     assert found.missing.endswith("the 5 lines after it are not read")
 
 
+def test_the_first_event_is_not_taken_for_a_header(tmp_path: Path) -> None:
+    with pytest.raises(RecordError, match="line 2: '0,5 1 90 Rx d 8 .*', expected an event"):
+        asc(tmp_path, "base hex\n0,5 1 90 Rx d 8 1F 20 12 00 00 00 00 00\n" + BODY)
+
+
 def test_a_trigger_block_without_end_is_cut_off(tmp_path: Path) -> None:
     found = asc(tmp_path, ASC.replace("End TriggerBlock\n", ""))
     assert len(found.words) == 3
@@ -514,7 +518,7 @@ def test_an_object_that_cannot_be(tmp_path: Path, bad: bytes, says: str) -> None
     found = blf(tmp_path / "x.blf", [thing() + thing() + bad], count=5)
     assert len(found.words) == 2
     assert found.missing.startswith(says)
-    assert found.missing.endswith(" of 5 objects read)")
+    assert found.missing.endswith(" objects read, 5 announced)")
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,7 @@ class _Log:
             self.open = found[1] == "begin"
         if HEADER.match(text):
             self.known = True
-        elif self._begun:
+        elif self._begun or text[0].isdigit():
             raise ValueError(f"{line[:60]!r}, expected an event")
 
     def _frame(self, words: list[str]) -> Row:
