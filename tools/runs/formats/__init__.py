@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, cast
 
+from ato_hil.tools.formats.common import CutOff, Row
 from ato_hil.tools.runs.formats import (
     asc,
     blf,
@@ -36,7 +37,7 @@ class Format:
 
 
 class Refused(Exception):
-    """The file is empty, or of another kind than its name says."""
+    """The file is empty, or of another kind than its name says, or nothing of it can be trusted."""
 
 
 def _mf4_rows(stream: BinaryIO, head: bytes) -> Iterator[Row]:
@@ -112,7 +113,8 @@ def rows_of(path: Path) -> Iterator[Row]:
     except EOFError:
         raise CutOff("its compressed data have no end") from None
     except (zlib.error, gzip.BadGzipFile) as error:
-        raise Damaged(f"its compressed data: {error}") from None
+        # Where the damage is nobody knows: what was unpacked before it is noticed may repeat lines.
+        raise Refused(f"its compressed data are damaged: {error}") from None
 
 
 def kind_of(head: bytes) -> str:
