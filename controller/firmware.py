@@ -3,10 +3,10 @@
 Contract of `tick(params, profile, state, memory, rx, tx, period)`: a step. It reads `rx`
 (mailboxes, cleared by the caller after the tick), `params`, `profile`; writes `state`, `memory`,
 `tx`; takes bounded time; never raises, whatever is in the mailboxes. `period` is 1 when a control
-period has passed, 0 to look at RUN_CTRL alone. In order: decode and end-to-end check, ages, the
-onboard reference, the neighbours and what they make of it, the law, the guard, distribution over
-the cars, encode and protect. The process around it moves payloads and stores the learning memory,
-nothing else.
+period has passed, 0 to look at RUN_CTRL alone. In order: `before_law` (decode and end-to-end check,
+ages, the onboard reference, the neighbours and what they make of it), the law, `after_law` (the
+guard, distribution over the cars, encode and protect). The process around it moves payloads and
+stores the learning memory, nothing else.
 """
 
 from __future__ import annotations
@@ -446,6 +446,121 @@ def estimate_word(index: Any, exponent: Any, value: Any) -> Any:
     )
 
 
+@step
+def run_control(params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any) -> None:
+    """Follows RUN_CTRL, if it has come: run state, iteration, the start of a run."""
+    core = state.core
+    if receive(params.slow, state, rx, RUN_CTRL) != 0:
+        word = int64(rx[RUN_CTRL.index].payload)
+        wanted = get(word, RUN_CTRL.RunState)
+        if wanted > ENDED:
+            wanted = int64(IDLE)
+        if wanted == RUNNING:
+            # A run starts only from armed: a controller that restarts inside a run stays silent.
+            if int64(core.run_state) == ARMED:
+                core.run_state = RUNNING
+        else:
+            core.run_state = wanted
+            core.iteration = get(word, RUN_CTRL.Iteration)
+            if wanted == ARMED:
+                rate = get(word, RUN_CTRL.TimetableRate) << _RATE_SHIFT
+                begin(params, profile, state, cells, rate)
+            e2e.send(core, tx, ATO_STATUS, status_word(params, core))
+
+
+@step
+def before_law(
+    params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any, period: Any
+) -> Any:
+    """All that a tick does up to the law: `state.inputs` and `state.cell` are then what the law
+    reads. 1 if the law runs in this tick, 0 if nothing is left to do."""
+    run_control(params, profile, state, cells, rx, tx)
+    core = state.core
+    inputs = state.inputs
+    if int64(core.run_state) != RUNNING or period != 1:
+        return int64(0)
+    read_inputs(params, state, rx)
+    inputs.tick = core.tick
+    inputs.iteration = core.iteration
+    read_reference(params, state)
+    if neighbours.any_exist(params.neighbours) != 0:
+        core.faults = int64(core.faults) | read_line(params, state, rx)
+    read_map(params, state)
+    stands = int64(inputs.reference_speed) == 0 and int64(inputs.ahead_speed) == 0
+    state.seen.timetable_stands = 1 if stands else 0
+    memory.gather(params.memory, state.memory, cells, state.cell, int64(inputs.position))
+    return int64(1)
+
+
+@step
+def after_law(params: Any, profile: Any, state: Any, cells: Any, tx: Any) -> None:
+    """All that a tick does with what the law left in `state.outputs` and `state.cell`: learning
+    memory, guard, distribution over the cars, frames; then the reference goes on by a tick."""
+    core = state.core
+    memory.scatter(params.memory, state.memory, cells, state.cell)
+    command(params, state)
+    send(params, state, tx)
+    reference.advance(params.reference, state.cursor, profile)
+    reference.advance(params.reference, state.ahead, profile)
+    core.tick = int64(core.tick) + 1
+
+
+@step
+def command(params: Any, state: Any) -> None:
+    """What the guard leaves of the law's force, in whole units of FORCE_CMD and shared out over the
+    cars; faults and guard state."""
+    core = state.core
+    faults = (
+        int64(core.faults)
+        | int64(state.outputs.status)
+        | guard.faults_of_inputs(params.guard, state.seen)
+        | guard.faults_of_motion(params.guard, state.seen)
+    )
+    core.faults = faults
+    core.guard = guard.state_of(params.guard, state.guard, state.seen, faults)
+    wanted = int64(state.outputs.force)
+    specific = guard.limited(params.guard, state.guard, state.seen, int64(core.guard), wanted)
+    asked = round_shift(specific * int64(params.core.mass), Q_ACCELERATION) >> _FORCE_SHIFT
+    force = saturate(FORCE_CMD.Force, asked) << _FORCE_SHIFT
+    force = distribution.distribute(params.distribution, force, core.car_force)
+    limited = specific != wanted or force >> _FORCE_SHIFT != asked
+    state.inputs.limited = 1 if limited else 0
+    core.force = force
+
+
+@step
+def send(params: Any, state: Any, tx: Any) -> None:
+    """The frames of a tick of a run; FORCE_CMD is the last, who waits for it has them all."""
+    core = state.core
+    tick = int64(core.tick)
+    car_words(core, tx, int64(params.distribution.cars))
+    phase = tick % STATUS_PERIOD
+    if phase == 0:
+        e2e.send(core, tx, ATO_STATUS, status_word(params, core))
+        e2e.send(core, tx, ATO_TRACKING, tracking_word(state.inputs))
+    if phase < int64(params.core.estimates):
+        e2e.send(
+            core,
+            tx,
+            ATO_ESTIMATE,
+            estimate_word(
+                phase,
+                int64(params.core.exponent[phase]),
+                int64(state.outputs.estimate[phase]),
+            ),
+        )
+    if phase == 0 and neighbours.any_exist(params.neighbours) != 0:
+        e2e.send(core, tx, ATO_RADIO, radio_word(state))
+    e2e.send(
+        core,
+        tx,
+        FORCE_CMD,
+        put(FORCE_CMD.Force, int64(core.force) >> _FORCE_SHIFT)
+        + put(FORCE_CMD.Mode, mode_of(int64(core.guard), int64(core.force)))
+        + put(FORCE_CMD.Tick, tick & TICK_MASK),
+    )
+
+
 def build_tick(law_step: Any) -> Any:
     """The cyclic task around one law, as a step `tick(params, profile, state, memory, rx, tx,
     period)`.
@@ -455,95 +570,11 @@ def build_tick(law_step: Any) -> Any:
     """
 
     @step
-    def run_tick(params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any) -> None:
-        core = state.core
-        inputs = state.inputs
-        inputs.tick = core.tick
-        inputs.iteration = core.iteration
-        read_reference(params, state)
-        has_neighbours = neighbours.any_exist(params.neighbours) != 0
-        if has_neighbours:
-            core.faults = int64(core.faults) | read_line(params, state, rx)
-        read_map(params, state)
-        stands = int64(inputs.reference_speed) == 0 and int64(inputs.ahead_speed) == 0
-        state.seen.timetable_stands = 1 if stands else 0
-
-        memory.gather(params.memory, state.memory, cells, state.cell, int64(inputs.position))
-        law_step(params.law, state.law, state.cell, inputs, state.outputs)
-        memory.scatter(params.memory, state.memory, cells, state.cell)
-
-        faults = (
-            int64(core.faults)
-            | int64(state.outputs.status)
-            | guard.faults_of_inputs(params.guard, state.seen)
-            | guard.faults_of_motion(params.guard, state.seen)
-        )
-        core.faults = faults
-        core.guard = guard.state_of(params.guard, state.guard, state.seen, faults)
-        wanted = int64(state.outputs.force)
-        specific = guard.limited(params.guard, state.guard, state.seen, int64(core.guard), wanted)
-        asked = round_shift(specific * int64(params.core.mass), Q_ACCELERATION) >> _FORCE_SHIFT
-        force = saturate(FORCE_CMD.Force, asked) << _FORCE_SHIFT
-        force = distribution.distribute(params.distribution, force, core.car_force)
-        raw = force >> _FORCE_SHIFT
-        inputs.limited = 1 if specific != wanted or raw != asked else 0
-        core.force = force
-
-        tick = int64(core.tick)
-        car_words(core, tx, int64(params.distribution.cars))
-        phase = tick % STATUS_PERIOD
-        if phase == 0:
-            e2e.send(core, tx, ATO_STATUS, status_word(params, core))
-            e2e.send(core, tx, ATO_TRACKING, tracking_word(inputs))
-        if phase < int64(params.core.estimates):
-            e2e.send(
-                core,
-                tx,
-                ATO_ESTIMATE,
-                estimate_word(
-                    phase,
-                    int64(params.core.exponent[phase]),
-                    int64(state.outputs.estimate[phase]),
-                ),
-            )
-        if has_neighbours and phase == 0:
-            e2e.send(core, tx, ATO_RADIO, radio_word(state))
-        e2e.send(
-            core,
-            tx,
-            FORCE_CMD,
-            put(FORCE_CMD.Force, raw)
-            + put(FORCE_CMD.Mode, mode_of(int64(core.guard), force))
-            + put(FORCE_CMD.Tick, tick & TICK_MASK),
-        )
-        reference.advance(params.reference, state.cursor, profile)
-        reference.advance(params.reference, state.ahead, profile)
-        core.tick = tick + 1
-
-    @step
     def tick(
         params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any, period: Any
     ) -> None:
-        core = state.core
-        if receive(params.slow, state, rx, RUN_CTRL) != 0:
-            word = int64(rx[RUN_CTRL.index].payload)
-            wanted = get(word, RUN_CTRL.RunState)
-            if wanted > ENDED:
-                wanted = int64(IDLE)
-            if wanted == RUNNING:
-                # A run starts only from armed: a controller that restarts inside a run stays
-                # silent.
-                if int64(core.run_state) == ARMED:
-                    core.run_state = RUNNING
-            else:
-                core.run_state = wanted
-                core.iteration = get(word, RUN_CTRL.Iteration)
-                if wanted == ARMED:
-                    rate = get(word, RUN_CTRL.TimetableRate) << _RATE_SHIFT
-                    begin(params, profile, state, cells, rate)
-                e2e.send(core, tx, ATO_STATUS, status_word(params, core))
-        if int64(core.run_state) == RUNNING and period == 1:
-            read_inputs(params, state, rx)
-            run_tick(params, profile, state, cells, rx, tx)
+        if before_law(params, profile, state, cells, rx, tx, period) != 0:
+            law_step(params.law, state.law, state.cell, state.inputs, state.outputs)
+            after_law(params, profile, state, cells, tx)
 
     return tick
