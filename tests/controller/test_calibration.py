@@ -550,9 +550,9 @@ def test_a_law_that_is_gone_is_named(path):
     "name", ["ailc", "adaptive", "cailc", "iplc", "norm-optimal", "pdilc", "pid"]
 )
 def test_every_law_file_has_what_the_house_expects(name):
-    module = load_law(name)
-    assert module.PARAMS.isalignedstruct
-    assert module.STATE.isalignedstruct
-    assert len(module.ESTIMATES) <= 10
+    law = load_law(name)
+    assert law.PARAMS.isalignedstruct
+    assert law.STATE.isalignedstruct
+    assert len(law.ESTIMATES) <= 10
     assert law_number(name) != 31
-    assert hasattr(module, "learned") == bool(module.WORDS)
+    assert hasattr(law.module, "learned") == bool(law.WORDS)

@@ -24,7 +24,6 @@ import numpy as np
 from ato_hil.can_dbc.codec import MAILBOX
 from ato_hil.controller import firmware as controller_firmware
 from ato_hil.controller import reference, tick_sources
-from ato_hil.controller.registry import law_step
 from ato_hil.plant_sim import (
     atp,
     plant,
@@ -71,7 +70,7 @@ class Loop:
         plant_params = plant.params_dtype(model.PARAMS)
         plant_state = plant.state_dtype(model.STATE)
         modules = tick_sources.modules_of([law])
-        modules += [importlib.import_module(f"plant_sim.{name}") for name in PLANT_MODULES]
+        modules += [importlib.import_module(f"ato_hil.plant_sim.{name}") for name in PLANT_MODULES]
         modules += [
             importlib.import_module(f"ato_hil.plant_sim.trains.{found.name}")
             for found in pkgutil.iter_modules(trains.__path__)
@@ -90,9 +89,8 @@ class Loop:
             },
         )
         self.program = Program(self.records.name)
-        step = law_step(module)
         _, sense, act = plant.build(model)
-        tick = controller_firmware.build_tick(step)
+        tick = controller_firmware.build_tick(module.step)
         limits = Fields(
             "ato_limits",
             tuple(

@@ -29,7 +29,7 @@ from ato_hil.controller import (
     tick_sources,
 )
 from ato_hil.controller.calibration import Calibration
-from ato_hil.controller.registry import law_label, law_step, load_law
+from ato_hil.controller.registry import Law, law_label, load_law
 from ato_hil.tools.export import ExportError
 from ato_hil.tools.export.kinds import INT, Array, Record
 from ato_hil.tools.export.records import Records, initialiser
@@ -67,7 +67,7 @@ class Firmware:
         return self.calibrations[0]
 
     @property
-    def law(self) -> Any:
+    def law(self) -> Law:
         return load_law(self.first.law)
 
     @property
@@ -92,7 +92,7 @@ class Translated:
         fields: Any = params.fields
         state_fields: Any = state.fields
         self.tick = self.program.root(
-            firmware.build_tick(law_step(law)),
+            firmware.build_tick(law.step),
             (
                 Record(params),
                 Array(reference.SEGMENT),
@@ -340,8 +340,8 @@ def header_file(made: Translated) -> str:
         period_ms=period_ms(fw),
     )
     text = reflowed(text)
-    law_text = f"The law, {source_of(law).file}:\n\n{inspect.getdoc(law) or ''}"
-    bounds = getattr(law, "STATE_BOUNDS", {})
+    law_text = f"The law, {source_of(law.module).file}:\n\n{inspect.getdoc(law.module) or ''}"
+    bounds = law.STATE_BOUNDS
     lines = [
         *top(fw, text),
         "#ifndef ATO_H",

@@ -133,7 +133,7 @@ def run_numbers(law: str, runs: int, learned: int = -1) -> range:
     their file)."""
     if learned >= 0:
         return range(learned + 1, learned + 1 + runs)
-    return range(0 if getattr(load_law(law), "INITIAL_RUN", False) else 1, runs + 1)
+    return range(0 if load_law(law).INITIAL_RUN else 1, runs + 1)
 
 
 def error_weight(loaded: Loaded, law: str) -> float | None:

@@ -38,7 +38,7 @@ from ato_hil.controller import (
 )
 from ato_hil.controller.interface import INPUTS, OUTPUTS, RUNNING
 from ato_hil.controller.memory import CELL
-from ato_hil.controller.registry import law_step, load_law
+from ato_hil.controller.registry import load_law
 from ato_hil.plant_sim.scenario import load
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.verify import (
@@ -100,7 +100,7 @@ def law_records(law: str) -> list[np.ndarray]:
 
 def check_law(law: str) -> Iterator[Row]:
     """Cost of a law's step; for the laws that have a C twin, the ratio to it."""
-    loop = build_law_loop(law_step(load_law(law)))
+    loop = build_law_loop(load_law(law).step)
     mine = law_records(law)
     if law not in C_LAWS:
         (ns,) = fastest_ns([lambda: loop(ROWS, *mine)])

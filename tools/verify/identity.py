@@ -65,7 +65,7 @@ def scenarios_of(law: str) -> list[str]:
     are about that one; for a law in a file of its own the one that its SCENARIO names, the default
     scenario without."""
     if is_file(law):
-        return [getattr(load_law(law), "SCENARIO", OWN_LAW_SCENARIO)]
+        return [load_law(law).SCENARIO or OWN_LAW_SCENARIO]
     return [
         name
         for name in case_names()

@@ -15,6 +15,7 @@ import pytest
 from ato_hil.can_dbc.step import int64, step
 from ato_hil.controller import calibration, node
 from ato_hil.controller.laws import afilc
+from ato_hil.controller.registry import law_of
 from ato_hil.plant_sim import track, world
 from ato_hil.plant_sim.scenario import at_rate, load
 from ato_hil.tools.papers.afilc import reference as reference
@@ -437,15 +438,17 @@ def calibrate_float(gains, vehicle):
     return params
 
 
-FLOAT_LAW = SimpleNamespace(
-    __name__="afilc_float",
-    PARAMS=FLOAT_PARAMS,
-    STATE=FLOAT_STATE,
-    WORDS=(),
-    ESTIMATES=(),
-    Gains=afilc.Gains,
-    calibrate=calibrate_float,
-    afilc_float=afilc_float,
+FLOAT_LAW = law_of(
+    SimpleNamespace(
+        __name__="afilc_float",
+        PARAMS=FLOAT_PARAMS,
+        STATE=FLOAT_STATE,
+        WORDS=(),
+        ESTIMATES=(),
+        Gains=afilc.Gains,
+        calibrate=calibrate_float,
+        afilc_float=afilc_float,
+    )
 )
 
 

@@ -20,6 +20,7 @@ from ato_hil.controller import calibration, node
 from ato_hil.controller.interface import RUNNING
 from ato_hil.controller.laws import drac, drac_robust
 from ato_hil.controller.quantise import Vehicle
+from ato_hil.controller.registry import law_of
 from ato_hil.plant_sim.scenario import Loaded, load
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.frames import commanded_force_n
@@ -232,15 +233,17 @@ def drac_float(params, state, cell, inputs, outputs):
     outputs.status = 0
 
 
-FLOAT_LAW = SimpleNamespace(
-    __name__="drac_float",
-    PARAMS=FLOAT_PARAMS,
-    STATE=FLOAT_STATE,
-    WORDS=(),
-    ESTIMATES=(),
-    Gains=FloatGains,
-    calibrate=calibrate_float,
-    drac_float=drac_float,
+FLOAT_LAW = law_of(
+    SimpleNamespace(
+        __name__="drac_float",
+        PARAMS=FLOAT_PARAMS,
+        STATE=FLOAT_STATE,
+        WORDS=(),
+        ESTIMATES=(),
+        Gains=FloatGains,
+        calibrate=calibrate_float,
+        drac_float=drac_float,
+    )
 )
 
 

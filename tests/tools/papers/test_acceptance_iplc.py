@@ -18,6 +18,7 @@ from ato_hil.can_dbc.step import step
 from ato_hil.controller import calibration, node
 from ato_hil.controller.interface import INPUTS
 from ato_hil.controller.laws import iplc
+from ato_hil.controller.registry import law_of
 from ato_hil.plant_sim.scenario import load, overlaid
 from ato_hil.tools.papers.iplc.reference import REFERENCES
 from ato_hil.tools.runs import onboard
@@ -307,10 +308,12 @@ def iplc_without_sums(params, state, cell, inputs, outputs):
     iplc.iplc(params, state, cell, inputs, outputs)
 
 
-WITHOUT_SUMS = SimpleNamespace(
-    **{name: value for name, value in vars(iplc).items() if not name.startswith("__")},
-    __name__="iplc_without_sums",
-    iplc_without_sums=iplc_without_sums,
+WITHOUT_SUMS = law_of(
+    SimpleNamespace(
+        **{name: value for name, value in vars(iplc).items() if not name.startswith("__")},
+        __name__="iplc_without_sums",
+        iplc_without_sums=iplc_without_sums,
+    )
 )
 
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from ato_hil.tools.formats.common import CutOff, Row
 from ato_hil.tools.runs.formats import (
     asc,
     blf,
@@ -22,7 +21,7 @@ from ato_hil.tools.runs.formats import (
     common,
     pcapng,
 )
-from ato_hil.tools.runs.formats.common import CutOff, Damaged, Row
+from ato_hil.tools.runs.formats.common import CutOff, Row
 
 GZIP = ".gz"
 HEAD_BYTES = 512
