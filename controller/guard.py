@@ -34,6 +34,7 @@ from typing import Any
 
 import numpy as np
 
+from ato_hil.can_dbc.codec import ATP_LIMIT, values
 from ato_hil.can_dbc.step import int64, step
 from ato_hil.controller.interface import (
     FAULT_ATP,
@@ -84,9 +85,11 @@ FAULTS_THAT_BRAKE = sum(
 )
 
 # Supervision and Quality, as in ATP_LIMIT and TRAIN_SPEED.
-ATP_WARNING, ATP_SERVICE_BRAKE, ATP_EMERGENCY_BRAKE = 1, 2, 3
-SENSOR_INVALID = 2
-NO_TARGET = 65535  # TargetDistance of ATP_LIMIT
+ATP_WARNING, ATP_SERVICE_BRAKE, ATP_EMERGENCY_BRAKE = values(
+    "ATP_LIMIT", "Supervision", "warning service_brake emergency_brake"
+)
+(SENSOR_INVALID,) = values("TRAIN_SPEED", "Quality", "invalid")
+NO_TARGET = (1 << ATP_LIMIT.TargetDistance.length) - 1  # the largest distance that it can say
 
 PARAMS = np.dtype(
     [

@@ -62,6 +62,7 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 import numpy as np
 
+from ato_hil.can_dbc.codec import values
 from ato_hil.can_dbc.step import int64, step
 from ato_hil.plant_sim.brakes import Brake, Step, ticks_of
 from ato_hil.plant_sim.track import section_at
@@ -70,7 +71,9 @@ from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 NONE, MARGIN, ETCS = 0, 1, 2
 SUPERVISIONS = {"none": NONE, "margin": MARGIN, "etcs": ETCS}
 # What it demands, as in ATP_LIMIT.
-NORMAL, WARNING, SERVICE_BRAKE, EMERGENCY_BRAKE = 0, 1, 2, 3
+NORMAL, WARNING, SERVICE_BRAKE, EMERGENCY_BRAKE = values(
+    "ATP_LIMIT", "Supervision", "normal warning service_brake emergency_brake"
+)
 # The curves.
 EBD, EBI, SBI, WARN, PERMITTED = 0, 1, 2, 3, 4
 CURVES = 5

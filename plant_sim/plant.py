@@ -25,10 +25,10 @@ from ato_hil.can_dbc.codec import (
     RUN_CTRL,
     TRAIN_POSITION,
     TRAIN_SPEED,
-    choices,
     get,
     put,
     saturate,
+    values,
 )
 from ato_hil.can_dbc.step import int64, step
 from ato_hil.plant_sim import (
@@ -40,14 +40,13 @@ from ato_hil.plant_sim import (
 )
 from ato_hil.plant_sim.mail import received
 
-IDLE, ARMED, RUNNING, ENDED = 0, 1, 2, 3
-REAL_TIME = 1  # RUN_CTRL.Pace; 0 is the lockstep
+IDLE, ARMED, RUNNING, ENDED = values("RUN_CTRL", "RunState", "idle armed running ended")
+LOCKSTEP, REAL_TIME = values("RUN_CTRL", "Pace", "lockstep realtime")
 CONTROL_PERIOD_TICKS = 10  # RUN_CTRL comes every so many ticks
-NO_TARGET_M = 65535
+NO_TARGET_M = (1 << ATP_LIMIT.TargetDistance.length) - 1  # the largest that it can say
 TICK_MASK = 0xFFFF
 CARS_MAX = 8
-HOLD = choices("FORCE_CMD", "Mode")["hold"]
-EMERGENCY_REQUEST = choices("FORCE_CMD", "Mode")["emergency_request"]
+HOLD, EMERGENCY_REQUEST = values("FORCE_CMD", "Mode", "hold emergency_request")
 
 # Of ATP: where it steps in, and what it demands, as in ATP_LIMIT; NaN where nothing of the kind is
 # supervised.

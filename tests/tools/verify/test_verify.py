@@ -193,8 +193,8 @@ spec = importlib.util.spec_from_file_location("mutant.pid", sys.argv[1])
 module = importlib.util.module_from_spec(spec)
 sys.modules[spec.name] = module
 spec.loader.exec_module(module)
-found = overflow.search(registry.law_of(module), overflow.calibrated("pid"), 800)
-print(msgspec.json.encode(found).decode())
+report = overflow.search(registry.law_of(module), overflow.calibrated("pid"), 800)
+print(msgspec.json.encode(report).decode())
 """
 
 
