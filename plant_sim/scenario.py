@@ -24,7 +24,8 @@ import numpy as np
 
 from ato_hil.can_dbc.errors import InputError
 from ato_hil.plant_sim.actuator import Actuator
-from ato_hil.plant_sim.atp import Atp, braking_fault
+from ato_hil.plant_sim.atp import Atp
+from ato_hil.plant_sim.atp_tables import braking_fault
 from ato_hil.plant_sim.line import Line
 from ato_hil.plant_sim.planner import PlanError, ProfilePlan, plan_profile
 from ato_hil.plant_sim.profile import (
