@@ -19,6 +19,7 @@ from ato_hil.can_dbc.bus import choose_bus, open_bus
 from ato_hil.can_dbc.child import python
 from ato_hil.plant_sim.scenario import load
 from ato_hil.tools.session import in_process, session
+from ato_hil.tools.session.options import Silent
 from ato_hil.tools.trace import live_viewer
 
 SCENARIO = "subway-fast"
@@ -42,15 +43,6 @@ class Figure:
     def ratio(self) -> float:
         """How many times the peer's rate; nan without a peer."""
         return self.ticks_per_s / self.peer_ticks_per_s
-
-
-class _Silent:
-    """Watches a session without a word."""
-
-    def begin(self, *_: Any) -> None: ...
-    def note(self, text: str) -> None: ...
-    def progress(self, run: int, tick: int) -> None: ...
-    def row(self, row: dict[str, Any]) -> None: ...
 
 
 def measure(bus: str) -> list[Figure]:
@@ -92,7 +84,7 @@ def session_rate() -> float:
     digest and metrics counted."""
     marks: list[float] = []
 
-    class Clock(_Silent):
+    class Clock(Silent):
         def row(self, row: dict[str, Any]) -> None:
             marks.append(time.perf_counter())
             ticks.append(row["ticks"])
@@ -153,7 +145,7 @@ def hil_rate(bus: str, viewer: live_viewer.LiveView | None = None) -> float:
         options = session.Options(
             HIL_SCENARIO, None, 3, "hil", bus, 1, Path(folder), None, viewer=viewer
         )
-        summary = session.run(options, _Silent())
+        summary = session.run(options, Silent())
     return float(np.median([row["ticks_per_s"] for row in summary["runs"]]))
 
 

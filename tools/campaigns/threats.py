@@ -75,6 +75,7 @@ from ato_hil.tools.runs.files import write_json, write_text
 from ato_hil.tools.runs.result import Run
 from ato_hil.tools.session import session
 from ato_hil.tools.session.in_process import runs as runs_in_process
+from ato_hil.tools.session.options import Silent
 
 SCENARIO = """\
 # A hop between two stops, for `ato-hil threats`.
@@ -195,20 +196,14 @@ def run(
     return campaign
 
 
-class _Progress:
+class _Progress(Silent):
     """Watches the session on the bus."""
 
     def __init__(self, progress: Callable[[str], None]) -> None:
         self._progress = progress
 
-    def begin(self, loaded: Loaded, law: str, runs: range) -> None: ...
-
-    def note(self, text: str) -> None: ...
-
     def progress(self, run: int, tick: int) -> None:
         self._progress(f"on the bus: run {run}")
-
-    def row(self, row: dict[str, Any]) -> None: ...
 
 
 def threats() -> list[Threat]:

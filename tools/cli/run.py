@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +10,6 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from ato_hil.can_dbc.child import python
 from ato_hil.tools.cli.columns import cell, columns_of, faults_of, shown_rows
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
@@ -174,11 +171,6 @@ def run(
     ] = None,
 ) -> None:
     """Run a scenario: the train follows its profile, run by run."""
-    if mode is Mode.mil and os.environ.get("ATO_HIL_INTERPRETED") != "1":
-        # The choice is made when the steps are imported, so in a process that has not imported
-        # them.
-        environment = {**os.environ, "ATO_HIL_INTERPRETED": "1"}
-        os.execve(sys.executable, python("-m", "ato_hil", *sys.argv[1:]), environment)
     with one_line_for_bad_input(), sigterm_as_ctrl_c(), ExitStack() as stack:
         from ato_hil.tools.session.session import Options
 

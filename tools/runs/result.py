@@ -6,14 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ato_hil.can_dbc.errors import InputError
 from ato_hil.can_dbc.faults import Event
 from ato_hil.plant_sim.scenario import Loaded
 from ato_hil.tools.runs import summary_row
 from ato_hil.tools.runs.frames import LineDigest, digest_of_line
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,8 @@ class Run:
     memory: tuple[np.ndarray, int] | None = None  # learned: [cells, words], ticks of a cell
     punctuality: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))
     timing: np.ndarray | None = None  # of a run in real time: realtime.table
+    recorded: dict[str, Any] | None = None  # the row of summary.json that was read from there
+    missing: str = ""  # why there are neither frames nor truths
 
     @property
     def digest(self) -> str:
@@ -46,6 +52,26 @@ class Run:
         """Control periods that it lasted."""
         return len(self.truths[0])
 
+    @property
+    def bus(self) -> pa.Table:
+        """Every signal of the bus by tick: `tables.bus`. Raises InputError if it was not kept."""
+        from ato_hil.tools.runs import tables  # Arrow takes a moment: only who asks pays for it
+
+        self._refuse_missing()
+        return tables.bus(self.frames, self.ticks, self.members[0].scenario.period_s)
+
+    @property
+    def truth(self) -> pa.Table:
+        """The true state by tick: `tables.truth`. Raises InputError if it was not kept."""
+        from ato_hil.tools.runs import tables
+
+        self._refuse_missing()
+        return tables.truth(self.truths, self.members[0].scenario.period_s)
+
+    def _refuse_missing(self) -> None:
+        if self.missing:
+            raise InputError(f"run {self.number}: {self.missing}")
+
     @cached_property
     def metrics(self) -> dict[str, Any]:
         """As `summary_row.run_row`; measured when it is first asked for."""
@@ -54,6 +80,8 @@ class Run:
     @property
     def row(self) -> dict[str, Any]:
         """The row of summary.json."""
+        if self.recorded is not None:
+            return self.recorded
         row = {
             "run": self.number,
             **self.metrics,

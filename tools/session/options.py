@@ -24,6 +24,7 @@ from ato_hil.tools.session.external_nodes import CONTROLLER, PLANT
 from ato_hil.tools.trace.live_viewer import LiveView
 
 RUNS_MAX = 4095  # Iteration has 12 bits
+MODES = ("hil", "sil", "mil")
 LOCKSTEP, REALTIME = "lockstep", "realtime"
 
 
@@ -45,6 +46,15 @@ class Listener(Protocol):
 
     def row(self, row: dict[str, Any]) -> None:
         """A run is done."""
+
+
+class Silent:
+    """Watches a session without a word."""
+
+    def begin(self, loaded: Loaded, law: str, runs: range) -> None: ...
+    def note(self, text: str) -> None: ...
+    def progress(self, run: int, tick: int) -> None: ...
+    def row(self, row: dict[str, Any]) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -141,7 +151,13 @@ class Setup:
 def check(options: Options) -> Setup:
     """Raises ScenarioError, LawError, CalibrationError, MemoryFileError, RecordError, FaultError or
     SessionError for what is not good."""
-    require_compiler()
+    for name, value, least in (("runs", options.runs, 1), ("seed", options.seed, 0)):
+        if value is not None and (not isinstance(value, int) or value < least):
+            raise SessionError(f"{name} is {value!r}, expected a whole number from {least} on")
+    if options.mode not in MODES:
+        raise SessionError(f"mode is {options.mode!r}, expected one of {', '.join(MODES)}")
+    if options.mode != "mil":
+        require_compiler()
     loaded = load(options.scenario)
     trains = members(loaded)
     if len(trains) > 1:
@@ -192,6 +208,8 @@ def _controllers(options: Options, trains: list[Loaded]) -> tuple[str, list[Cali
     load_law(law)
     calibrations = [onboard.calibration_for(train, law) for train in trains]
     if options.firmware is not None:
+        if options.mode == "mil":
+            raise SessionError(f"{options.firmware}: a library needs mode sil or hil, this is mil")
         for calibration in calibrations:
             library.load(options.firmware, calibration)  # refuses what is not for this session
     learned = -1 if options.memory is None else node.last_iteration(calibrations[0], options.memory)

@@ -1,7 +1,7 @@
 """One session: the runs of one scenario and law in one mode, with their trace and summary.
 
-Modes: `sil` (one compiled loop), `mil` (the same loop interpreted, in a process started with
-ATO_HIL_INTERPRETED=1), `hil` (three processes on a bus). All give the same digest. In HIL
+Modes: `sil` (one compiled loop), `mil` (the same loop interpreted, in a child process where this
+one compiles), `hil` (three processes on a bus). All give the same digest. In HIL
 plant or controller, or both, may be external: started by their owner, known by their frames alone.
 Only HIL can also go by the clock, pace `realtime`: its digest depends on what was in time.
 """
@@ -11,21 +11,20 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Generator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
 from ato_hil.can_dbc import faults
-from ato_hil.controller import node
+from ato_hil.can_dbc.step import INTERPRETED
 from ato_hil.controller.registry import is_file
 from ato_hil.plant_sim.scenario import FOLDER
 from ato_hil.tools.runs import can_logs, environment
 from ato_hil.tools.runs.files import write_json, write_text
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
 from ato_hil.tools.runs.result import Run
-from ato_hil.tools.session import in_process
+from ato_hil.tools.session.makers import InProcess, Interpreted, Maker
 from ato_hil.tools.session.options import (
     LOCKSTEP,
     RUNS_MAX,
@@ -37,8 +36,6 @@ from ato_hil.tools.session.options import (
 )
 from ato_hil.tools.session.over_bus import OverBus, line_buses
 from ato_hil.tools.session.processes import RunError
-from ato_hil.tools.trace import facts
-from ato_hil.tools.trace.writer import TraceWriter
 
 __all__ = [
     "EXTERNAL_LAW",
@@ -78,87 +75,6 @@ def begin(options: Options, listener: Listener) -> Session:
     prepare(options.out)
     listener.begin(setup.loaded, setup.law, setup.runs)
     return Session(setup, listener)
-
-
-class Maker(Protocol):
-    """Who makes the runs, in one mode."""
-
-    about: dict[str, Any]  # for summary.json: bus, controller
-    us_per_frame: float | None  # that the trace has taken
-
-    @property
-    def injected(self) -> list[faults.Event] | None:
-        """All faults, if only the maker knows those of a run that was cut short."""
-
-    @property
-    def timing(self) -> dict[str, Any] | None:
-        """How punctual a session in real time was."""
-
-    def runs(self) -> Generator[Run, None, None]:
-        """One after the other. Raises RunError."""
-
-    def tell(self, run: Run) -> None:
-        """What is known of a run to the trace, if there is one."""
-
-
-class InProcess:
-    """Runs in this process."""
-
-    injected: list[faults.Event] | None = None
-    timing: dict[str, Any] | None = None
-
-    def __init__(self, setup: Setup, listener: Listener) -> None:
-        self.setup, self.listener = setup, listener
-        self.us_per_frame: float | None = None
-        self._writer: TraceWriter | None = None
-        memory = setup.options.memory
-        firmware = setup.options.firmware
-        self._nodes = [node.build(each, memory, firmware) for each in setup.calibrations]
-        self.about = {
-            "controller": {
-                "state_bytes": self._nodes[0].state_bytes,
-                "memory_bytes": self._nodes[0].memory_bytes,
-            }
-        }
-
-    def runs(self) -> Generator[Run, None, None]:
-        """One after the other."""
-        setup = self.setup
-        asked = setup.faults
-        with ExitStack() as stack:
-            if setup.options.trace:
-                self._writer = writer = TraceWriter(
-                    setup.options.out / "trace.rrd",
-                    reference=setup.loaded.profile,
-                    **setup.trace_settings,
-                )
-                stack.callback(self._close_trace, writer)
-                setup.look_on(self.listener, writer.end_live)
-            for run in in_process.drive(
-                setup.loaded,
-                self._nodes,
-                setup.runs,
-                setup.options.seed,
-                plan=None if asked is None else asked.bus,
-                fails=() if asked is None else asked.plant,
-                progress=self.listener.progress,
-            ):
-                yield replace(run, memory=self._memory()) if setup.words else run
-
-    def tell(self, run: Run) -> None:
-        """Frames and facts to the writer."""
-        if self._writer is not None:
-            for train, frames in enumerate(run.frames):
-                self._writer.frames(run.number, frames, train)
-            facts.apply(facts.of(run), self._writer)
-
-    def _memory(self) -> Any:
-        generation = int(self._nodes[0].state[0]["memory"]["generation"])
-        return self.setup.learned(self._nodes[0].cells[generation])
-
-    def _close_trace(self, writer: TraceWriter) -> None:
-        writer.close()
-        self.us_per_frame = writer.us_per_frame
 
 
 class Session:
@@ -218,6 +134,8 @@ class Session:
     def _maker(self, recording: can_logs.Recording | None) -> Maker:
         if self.setup.options.mode == "hil":
             return OverBus(self.setup, self.listener, recording)
+        if self.setup.options.mode == "mil" and not INTERPRETED:
+            return Interpreted(self.setup, self.listener)
         return InProcess(self.setup, self.listener)
 
     def _finish_run(self, run: Run, maker: Maker, recording: can_logs.Recording | None) -> None:
