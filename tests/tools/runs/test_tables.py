@@ -30,7 +30,7 @@ def test_every_signal_is_what_cantools_decodes(run: Run) -> None:
     for train, frames in enumerate(run.frames):
         for tick, frame_id, payload in frames.tolist():
             message = database().get_message_by_frame_id(frame_id)
-            decoded = message.decode(payload.to_bytes(8, "little", signed=True), False)
+            decoded: Any = message.decode(payload.to_bytes(8, "little", signed=True), False)
             row = expected[train * run.ticks + tick]
             row |= {f"{message.name}.{k}": v for k, v in decoded.items() if k not in HEADER}
     assert table.num_rows == len(expected)

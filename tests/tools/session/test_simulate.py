@@ -196,6 +196,7 @@ def test_what_is_not_there_is_an_attribute_error() -> None:
 def test_truth_and_memory_come_with_the_run(tmp_path: Path) -> None:
     file = tmp_path / "memory.bin"
     (run,) = ato_hil.simulate(SHORT, law="cailc", runs=1, memory=file)
+    assert run.memory is not None
     cells, decimation = run.memory
     assert file.exists()
     assert len(cells) * decimation >= run.ticks
