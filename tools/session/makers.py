@@ -15,6 +15,7 @@ import numpy as np
 from ato_hil.can_dbc import faults
 from ato_hil.controller import node, store
 from ato_hil.controller.node import Controller
+from ato_hil.tools.runs.can_logs import Recording
 from ato_hil.tools.runs.result import Run
 from ato_hil.tools.session import in_process, processes
 from ato_hil.tools.session.options import Listener, Setup
@@ -36,8 +37,9 @@ class Maker(Protocol):
     def timing(self) -> dict[str, Any] | None:
         """How punctual a session in real time was."""
 
-    def runs(self) -> Generator[Run, None, None]:
-        """One after the other. Raises RunError."""
+    def runs(self, recording: Recording | None) -> Generator[Run, None, None]:
+        """One after the other. The recording may get frames of runs that were cut short; the others
+        are the session's to add. Raises RunError."""
 
     def tell(self, run: Run) -> None:
         """What is known of a run to the trace, if there is one."""
@@ -55,7 +57,7 @@ class InProcess:
         self.us_per_frame: float | None = None
         self._writer: TraceWriter | None = None
 
-    def runs(self) -> Generator[Run, None, None]:
+    def runs(self, recording: Recording | None) -> Generator[Run, None, None]:
         """One after the other."""
         setup = self.setup
         with ExitStack() as stack:

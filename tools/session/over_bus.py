@@ -36,9 +36,10 @@ BUSY_S = 0.3  # how long to listen for other traffic, on all buses together
 class OverBus:
     """The runs of one session."""
 
-    def __init__(self, setup: Setup, listener: Listener, recording: Recording | None) -> None:
+    def __init__(self, setup: Setup, listener: Listener) -> None:
         """Raises BusError or SessionError if there is no such bus, or it cannot be used."""
-        self.setup, self.listener, self.recording = setup, listener, recording
+        self.setup, self.listener = setup, listener
+        self.recording: Recording | None = None
         self.us_per_frame: float | None = None  # that the trace has taken
         self.injected: list[faults.Event] | None = None  # faults, once all is over
         self._recorder: processes.Node | None = None
@@ -63,8 +64,9 @@ class OverBus:
         """How punctual a session in real time was."""
         return None if self._account is None else self._account.summary()
 
-    def runs(self) -> Generator[Run, None, None]:
+    def runs(self, recording: Recording | None) -> Generator[Run, None, None]:
         """One after the other; whatever ends the iteration ends the nodes. Raises RunError."""
+        self.recording = recording
         setup, options, loaded = self.setup, self.setup.options, self.setup.loaded
         real_time = None
         if options.pace == REALTIME:

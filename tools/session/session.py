@@ -112,9 +112,9 @@ class Session:
         maker: Maker | None = None
         try:
             with ExitStack() as stack:
+                maker = self._maker()  # before the recording: there may be no such bus
                 recording = stack.enter_context(self._recording())
-                maker = self._maker(recording)
-                made = stack.enter_context(closing(maker.runs()))
+                made = stack.enter_context(closing(maker.runs(recording)))
                 for run in made:
                     self._finish_run(run, maker, recording)
                     yield run
@@ -131,9 +131,9 @@ class Session:
         finally:
             self._conclude(maker)
 
-    def _maker(self, recording: can_logs.Recording | None) -> Maker:
+    def _maker(self) -> Maker:
         if self.setup.options.mode == "hil":
-            return OverBus(self.setup, self.listener, recording)
+            return OverBus(self.setup, self.listener)
         if self.setup.options.mode == "mil" and not INTERPRETED:
             return Interpreted(self.setup, self.listener)
         return InProcess(self.setup, self.listener)
