@@ -148,15 +148,14 @@ class Session:
         if self.setup.faults is not None:
             self._injected += run.injected
             self._save_injected()
+        maker.tell(run)  # first: a run that the summary has, the trace has
         if run.cut:
-            maker.tell(run)
             raise RunError(run.cut)
         if recording is not None:
             recording.add(run.number, run.frames[0])
         row = run.row
         self.summary["runs"].append(row)
         self.listener.row(row)
-        maker.tell(run)
 
     def _conclude(self, maker: Maker | None) -> None:
         """Write the summary."""
