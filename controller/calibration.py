@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.errors import validation
 from ato_hil.controller import (
     distribution,
     firmware,
@@ -157,7 +158,10 @@ def calibrate(
             words = _words(known, typed, vehicle)
         recall = _recalled(known, typed, int(words["words"][0]))
         pitch_m = _pitch_m(known, typed)
-    except (msgspec.ValidationError, CalibrationError) as error:
+    except msgspec.ValidationError as error:
+        text, where = validation(error, known.Gains)
+        raise CalibrationError(f"laws.{law_label(law)}{where}: {text}") from None
+    except CalibrationError as error:
         raise CalibrationError(f"laws.{law_label(law)}: {error}") from None
     except Exception as error:  # whatever the law's own Python does
         where = place(Path(law) if is_file(law) else Path(known.module.__file__ or ""), error)

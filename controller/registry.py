@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ato_hil.can_dbc.codec import choices
-from ato_hil.can_dbc.errors import InputError
+from ato_hil.can_dbc.errors import InputError, expected
 from ato_hil.controller import laws, subset
 from ato_hil.controller.quantise import Recall, Vehicle
 
@@ -73,7 +73,7 @@ def load_law(name: str) -> Law:
     if is_file(name):
         return law_of(_load_file(Path(name)))
     if name not in law_names():
-        raise LawError(f"law {name!r} is unknown, expected one of {', '.join(law_names())}")
+        raise LawError(f"law {name!r} is unknown, {expected(name, law_names())}")
     return law_of(importlib.import_module(f"ato_hil.controller.laws.{name.replace('-', '_')}"))
 
 

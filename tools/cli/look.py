@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
+from ato_hil.tools.cli import outline
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     fail,
@@ -20,20 +20,28 @@ from ato_hil.tools.cli.output import console
 
 def list_scenarios() -> None:
     """List the scenarios and the laws that each has gains for."""
-    from ato_hil.plant_sim.scenario import ScenarioError, case_names, load
+    rows = [
+        (name, " ".join(each.laws), f"{each.title}{_cases(each)}")
+        for name, each in outline.packaged().items()
+    ]
+    headings = ("scenario", "laws (default first)", "what it is; cases: `run SCENARIO:CASE`")
+    names, laws, _what = (max(map(len, column)) for column in zip(headings, *rows, strict=True))
+    lines = [f"{name:<{names}}  {of_it:<{laws}}  {what}" for name, of_it, what in (headings, *rows)]
+    if console.is_terminal and max(map(len, lines)) > console.width:
+        lines = [f"{name:<{names}}  {what}" for name, _laws, what in (headings, *rows)]
+    for line in lines:
+        console.print(
+            line,
+            markup=False,
+            emoji=False,
+            soft_wrap=not console.is_terminal,
+            no_wrap=True,
+            overflow="ellipsis",
+        )
 
-    table = Table("scenario", "laws (default first)", "run", "what it is", header_style="bold")
-    try:
-        for name in case_names():
-            loaded = load(name)
-            default = loaded.scenario.law
-            others = sorted(set(loaded.scenario.laws) - {default})
-            duration_s = loaded.ticks * loaded.scenario.period_s
-            length = f"{loaded.profile.position_m[-1]:.0f} m, {duration_s:.0f} s"
-            table.add_row(name, " ".join([default, *others]), length, loaded.scenario.title)
-    except ScenarioError as error:
-        raise fail(str(error), EXIT_BAD_INPUT) from None
-    console.print(table)
+
+def _cases(outlined: outline.Outline) -> str:
+    return f"; cases {' '.join(outlined.cases)}" if outlined.cases else ""
 
 
 def profile(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
+from ato_hil.can_dbc.errors import expected
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     EXIT_ENDED_EARLY,
@@ -41,7 +42,7 @@ def claims(
 
     known = papers.names()
     if paper not in known:
-        raise fail(f"no claims of {paper!r}, expected one of {', '.join(known)}", EXIT_BAD_INPUT)
+        raise fail(f"no claims of {paper!r}, {expected(paper, known)}", EXIT_BAD_INPUT)
     if json_file is not None and not json_file.absolute().parent.is_dir():
         raise fail(f"{json_file}: no such folder", EXIT_BAD_INPUT)
     table = Table("claim", "paper", "threshold", "measured", "holds", header_style="bold")

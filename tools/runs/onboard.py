@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 
+from ato_hil.can_dbc.errors import expected, validation
 from ato_hil.controller.calibration import (
     Calibration,
     GuardSettings,
@@ -34,8 +35,8 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
     scenario = loaded.scenario
     gains = scenario.laws.get(law_label(law), {} if is_file(law) else None)
     if gains is None:
-        known = ", ".join(sorted(scenario.laws))
-        raise ScenarioError(f"{loaded.path}: no gains for law {law!r}, the scenario has {known}")
+        known = expected(law, sorted(scenario.laws))
+        raise ScenarioError(f"{loaded.path}: no gains for law {law!r}, {known}")
     distribute = scenario.control.distribute
     try:
         return calibrate(
@@ -118,7 +119,8 @@ def _settings(key: str, values: dict[str, Any], kind: Any) -> Any:
     try:
         return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
-        raise CalibrationError(f"{key}: {error}") from None
+        text, place = validation(error, kind)
+        raise CalibrationError(f"{key}{place}: {text}") from None
 
 
 def cars(loaded: Loaded) -> int:
