@@ -292,7 +292,8 @@ def table(path: Path, name: str, kind: Any) -> list[Any]:
     except msgspec.ValidationError as error:
         text, place = validation(error, list[kind])
         if place.endswith(".kind"):
-            text += f", expected one of {', '.join(_kinds(kind))}"
+            given = text.partition("'")[2].rstrip("'")
+            text += f", {expected(given, _kinds(kind))}"
         raise FaultError(f"{path}: key {name}{place}: {text}") from None
     return entries
 

@@ -374,7 +374,7 @@ def test_another_process_reads_plan_and_log(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("[[bus]]\nkind = 'drip'", "key bus[0].kind: Invalid value 'drip', expected one of drop, "),
+        ("[[bus]]\nkind = 'drip'", "key bus[0].kind: Invalid value 'drip', did you mean drop?"),
         ("[[bus]]\nfrom = 1", "key bus[0]: Object missing required field `kind`"),
         ("[[bus]]\nkind = 'drop'\nbits = 2", "key bus[0]: Object contains unknown field `bits`"),
         ("[[bus]]\nkind = 'corrupt'\nbits = 0", "key bus[0].bits: Expected `int` >= 1"),

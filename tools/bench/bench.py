@@ -3,10 +3,10 @@ SIL against python-control."""
 
 from __future__ import annotations
 
-import math
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,28 +37,25 @@ class Figure:
     what: str
     ticks_per_s: float
     peer: str
-    peer_ticks_per_s: float
+    peer_ticks_per_s: float | None  # None: the peer is not installed
 
     @property
-    def ratio(self) -> float:
-        """How many times the peer's rate; nan without a peer."""
-        return self.ticks_per_s / self.peer_ticks_per_s
+    def ratio(self) -> float | None:
+        """How many times the peer's rate; None without a peer."""
+        return self.ticks_per_s / self.peer_ticks_per_s if self.peer_ticks_per_s else None
 
 
-def measure(bus: str) -> list[Figure]:
-    """SIL and HIL rates with their peers."""
+def measure(bus: str) -> Iterator[Figure]:
+    """SIL and HIL rates with their peers, one after the other."""
     peer = control_rate()
-    figures = [
-        Figure("SIL, whole chain, traces off", sil_rate(), "python-control", peer),
-        Figure("SIL, 250 000 ticks a run, whole session", session_rate(), "python-control", peer),
-        Figure(
-            "HIL, three processes, trace on", hil_rate(bus), "bare python-can echo", echo_rate(bus)
-        ),
-    ]
+    name = "python-control" if peer is not None else "python-control, not installed"
+    yield Figure("SIL, whole chain, traces off", sil_rate(), name, peer)
+    yield Figure("SIL, 250 000 ticks a run, whole session", session_rate(), name, peer)
+    echo = "bare python-can echo"
+    yield Figure("HIL, three processes, trace on", hil_rate(bus), echo, echo_rate(bus))
     with suppress(live_viewer.ViewerError):  # without a viewer there is nothing to measure
         alone, watched = watched_rates(bus)
-        figures.append(Figure("HIL, viewer looking on", watched, "HIL without it", alone))
-    return figures
+        yield Figure("HIL, viewer looking on", watched, "HIL without it", alone)
 
 
 def watched_rates(bus: str) -> tuple[float, float]:
@@ -98,13 +95,13 @@ def session_rate() -> float:
     return sum(ticks[1:]) / (marks[-1] - marks[0])
 
 
-def control_rate() -> float:
-    """The same loop, plant and law in floats, simulated by python-control; nan if that is not
+def control_rate() -> float | None:
+    """The same loop, plant and law in floats, simulated by python-control; None if that is not
     installed."""
     try:
         import control
     except ImportError:
-        return math.nan
+        return None
     loaded = load(SCENARIO)
     mass = loaded.scenario.train.mass_kg
     alpha, beta = 8.0, 1.1e5

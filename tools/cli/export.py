@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli.console import one_line_for_bad_input
-from ato_hil.tools.cli.output import console
+from ato_hil.tools.cli.console import one_line_for_bad_input, say
 
 app = typer.Typer(help="The firmware for other tools and targets.", no_args_is_help=True)
 
@@ -18,7 +17,6 @@ def group() -> None:
     """The firmware for other tools and targets."""
 
 
-@app.command("c")
 def c_command(
     scenario: Annotated[
         str, typer.Argument(help="Name of a scenario (`ato-hil list`) or a .toml file.")
@@ -37,6 +35,4 @@ def c_command(
         made = folder.files(scenario, law)
         folder.write(made, out)
     lines = sum(text.count("\n") for text in made.values())
-    console.print(
-        f"{out}: {len(made)} files, {lines} lines; the manual is {out / 'ato.h'}", soft_wrap=True
-    )
+    say(f"{out}: {len(made)} files, {lines} lines; the manual is {out / 'ato.h'}")

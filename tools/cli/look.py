@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.text import Text
 
 from ato_hil.tools.cli import outline
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     fail,
     one_line_for_bad_input,
+    say,
     sigterm_as_ctrl_c,
 )
 from ato_hil.tools.cli.options import Picture, ScenarioName
@@ -31,9 +33,7 @@ def list_scenarios() -> None:
         lines = [f"{name:<{names}}  {what}" for name, _laws, what in (headings, *rows)]
     for line in lines:
         console.print(
-            line,
-            markup=False,
-            emoji=False,
+            Text(line),
             soft_wrap=not console.is_terminal,
             no_wrap=True,
             overflow="ellipsis",
@@ -101,12 +101,12 @@ def view(
         with finished.prepared(recorded, law_compare) as trace:
             if screenshot is not None:
                 finished.screenshot(trace, screenshot, tab)
-                console.print(f"picture {screenshot}", soft_wrap=True)
+                say(f"picture {screenshot}")
                 return
             kind = live_viewer.WEB if web else live_viewer.NATIVE
             live_viewer.check(kind)
             process, text = live_viewer.show(kind, [str(trace.resolve())])
-            console.print(text, soft_wrap=True)
+            say(text)
             try:
                 status = process.wait()
             except KeyboardInterrupt:
@@ -139,13 +139,13 @@ def figures(
     with one_line_for_bad_input():
         for drawn in draw.figures([read(folder) for folder in folders]):
             if drawn.figure is None:
-                console.print(f"{drawn.stem}: not drawn: {drawn.why_not}", soft_wrap=True)
+                say(f"{drawn.stem}: not drawn: {drawn.why_not}")
                 continue
             files += draw.write(drawn, target, kinds)
-            console.print(f"{drawn.stem}: {drawn.drawing.caption}", soft_wrap=True)
+            say(f"{drawn.stem}: {drawn.drawing.caption}")
     if not files:
         raise fail("nothing could be drawn", EXIT_BAD_INPUT)
-    console.print(f"{len(files)} files in {target}", soft_wrap=True)
+    say(f"{len(files)} files in {target}")
 
 
 def report(
@@ -158,4 +158,4 @@ def report(
     target = out or folder / "report.html"
     with one_line_for_bad_input():
         page.write(folder, target)
-    console.print(f"report  {target}", soft_wrap=True)
+    say(f"report  {target}")

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli import buses, compare, export, look, prove, run
+from ato_hil.tools.cli import buses, clean, compare, export, look, prove, run
 from ato_hil.tools.cli.options import Viewer
 from ato_hil.tools.cli.output import ignore_other_tools, streams
 
@@ -27,6 +27,7 @@ COMMANDS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("report", look.report),
         ("list", look.list_scenarios),
         ("doctor", buses.doctor),
+        ("clean", clean.clean),
     ),
     "Compare": (
         ("compare", compare.compare),
@@ -46,12 +47,16 @@ COMMANDS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("profile", look.profile),
         ("bus-report", buses.bus_report),
     ),
+    "Take away": (("export c", export.c_command),),
 }
+GROUPS = {"": app, "export": export.app}  # of commands of two words
 
 for _panel, _commands in COMMANDS.items():
     for _name, _command in _commands:
         _help = " ".join((_command.__doc__ or "").split())  # without the line ends of the source
-        app.command(_name, rich_help_panel=_panel, help=_help)(_command)
+        _group, _, _last = _name.rpartition(" ")
+        GROUPS[_group].command(_last, rich_help_panel=_panel, help=_help)(_command)
+app.add_typer(export.app, name="export", rich_help_panel="Take away")
 
 
 def _version(asked: bool) -> None:
@@ -68,9 +73,6 @@ def every_command(
     ] = False,
 ) -> None:
     """Train control laws as fixed-point firmware, hardware-in-the-loop on a virtual CAN bus."""
-
-
-app.add_typer(export.app, name="export", rich_help_panel="Take away")
 
 
 def main() -> None:

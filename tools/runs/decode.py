@@ -8,6 +8,7 @@ once, some ten thousand rows at a time.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,11 +41,17 @@ class Decoded:
     missing: str  # what of the recording could not be read; the table has what comes before
 
 
-def decode(path: Path, out: Path, channel: str | None = None) -> Decoded:
+def decode(
+    path: Path,
+    out: Path,
+    channel: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Decoded:
     """Write the frames of a recording that the DBC knows as a table, whole or not at all. Of a
     recording that is cut off or damaged, those before that.
 
     :param out: a name that ends in .csv or .parquet.
+    :param progress: told how many of how many frames are written.
     :raises RecordError: the recording cannot be read, or the table cannot be written.
     """
     if out.suffix.lower() not in WRITERS:
@@ -62,6 +69,8 @@ def decode(path: Path, out: Path, channel: str | None = None) -> Decoded:
     try:
         with WRITERS[out.suffix.lower()](str(temporary), _schema(messages)) as writer:
             for start in range(0, len(rows), CHUNK_ROWS):
+                if progress:
+                    progress(start, len(rows))
                 writer.write_table(
                     _table(messages, recorded, run, tick, rows[start : start + CHUNK_ROWS])
                 )

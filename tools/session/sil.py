@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ato_hil.can_dbc.codec import MESSAGE_COUNT, MESSAGES
-from ato_hil.can_dbc.step import step
+from ato_hil.can_dbc.step import INTERPRETED, step
 from ato_hil.controller import node as controller_node
 from ato_hil.controller.interface import fault_names
 from ato_hil.plant_sim import plant, world
@@ -22,6 +22,7 @@ from ato_hil.plant_sim.scenario import Loaded, members
 from ato_hil.tools.runs.frames import FRAME
 from ato_hil.tools.runs.result import Run, Runs
 
+WATCHED_TICKS = 100  # between two looks at the interpreted loop
 FRAME_IDS = np.array([message.frame_id for message in MESSAGES], np.int32)
 
 
@@ -106,7 +107,10 @@ def run_line(
     here = world.build(loaded, seed)
     made = Runs(members(loaded), nodes[0].calibration.law)
     params, state, cells = _put_side_by_side(nodes, here)
-    loop = loop or build_loop(nodes[0].tick, here.sense, here.actuate_and_advance)
+    sense = here.sense
+    if INTERPRETED and progress:  # where a run takes minutes
+        sense = _watched(sense, lambda tick: progress(number, tick))
+    loop = loop or build_loop(nodes[0].tick, sense, here.actuate_and_advance)
     trains = len(nodes)
     counts = np.zeros(trains, np.int64)
 
@@ -129,6 +133,7 @@ def run_line(
             counts,
         )
 
+    number = runs.start
     # Compiles, or loads what was compiled before.
     kinds = (plant.CHANCE, plant.TRUTH, FRAME)
     drive(0, *(world.rows(np.zeros((trains, 0), kind)) for kind in kinds))
@@ -152,6 +157,18 @@ def run_line(
             progress(number, ticks)
         sent = [of_train[:count] for of_train, count in zip(frames, counts, strict=True)]
         yield made.add(number, sent, list(truth), faults, seconds)
+
+
+def _watched(sense: Any, progress: Callable[[int], None]) -> Any:
+    """`sense` of the interpreted loop, which says now and then where the loop is."""
+
+    def watched(*arguments: Any) -> None:
+        tick = arguments[4]
+        if tick % WATCHED_TICKS == 0:
+            progress(tick)
+        sense(*arguments)
+
+    return watched
 
 
 def _put_side_by_side(

@@ -75,7 +75,8 @@ def test_help_shows_the_commands_in_their_groups() -> None:
     assert at == sorted(at)
     named = [name for commands in main.COMMANDS.values() for name, _function in commands]
     assert sorted(named) == sorted(set(named))
-    assert re.findall(r"^│ ([a-z-]+) ", text[at[0] :], re.M) == named
+    first_words = list(dict.fromkeys(name.split()[0] for name in named))
+    assert re.findall(r"^│ ([a-z-]+) ", text[at[0] :], re.M) == first_words
 
 
 def test_a_command_that_is_a_slip_away_is_suggested() -> None:
