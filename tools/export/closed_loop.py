@@ -132,7 +132,7 @@ class Loop:
         for module in program.modules:
             body += ["", f"/* {module.file} */"]
             for function in firmware.in_order(program, module):
-                body += ["", *firmware.definition(program, function, self.loop)]
+                body += ["", *firmware.definition(program, function, function is self.loop)]
         heads = [f"static {program.head(f)};" for f in functions if f is not self.loop]
         heads.append(f"{program.head(self.loop)};")
         arrays = [*self._tuple(), *self._several()]
