@@ -45,7 +45,7 @@ class Module:
     @property
     def file(self) -> str:
         """The path below the folder of the package, else its name alone."""
-        depth = self.name.count(".")
+        depth = max(self.name.count("."), 1)
         parts = self.path.parts[-depth:]
         return self.path.name if self.name.startswith("own_law.") else "/".join(parts)
 

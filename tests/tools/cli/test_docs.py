@@ -58,7 +58,7 @@ def test_every_option_on_the_page_is_taken() -> None:
             names, _, value = written.partition(" ")
             for name in names.split("/"):
                 values = [re.sub(r"\{(\w+).*", r"\1", value).replace("N", "1")] if value else []
-                done = CliRunner().invoke(app, [command, name, *values, "--help"])
+                done = CliRunner().invoke(app, [*command.split(), name, *values, "--help"])
                 assert done.exit_code == 0, f"{command} {name}: {done.output}"
                 tried.append(f"{command} {name}")
     assert {"claims --json", "figures --format", "run --no-trace", "view --web"} <= set(tried)
