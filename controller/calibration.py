@@ -389,6 +389,8 @@ def _reference(period_s: float, profile: np.ndarray, preview_ticks: int) -> np.n
 def _words(law: Law, gains: Any, vehicle: Vehicle) -> np.ndarray:
     """MEMORY_PARAMS with what the law says of its words."""
     params = np.zeros(1, memory.MEMORY_PARAMS)
+    if not law.WORDS:
+        return params
     initial, low, high = law.learned(gains, vehicle)
     words = len(initial)
     if not 1 <= words <= len(law.WORDS) or not words == len(low) == len(high):
