@@ -128,8 +128,7 @@ def _load_file(path: Path) -> ModuleType:
     except (Exception, SystemExit) as error:  # whatever the file does when it is executed
         del sys.modules[name]
         raise LawError(place(path, error)) from None
-    learned = ("learned",) if getattr(module, "WORDS", ()) else ()
-    for part in (*PARTS, *learned, path.stem):
+    for part in (*PARTS, path.stem):
         if not hasattr(module, part):
             del sys.modules[name]
             raise LawError(f"{path}: expected {part}, see the laws in {laws.__path__[0]}")

@@ -551,7 +551,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_the_law_itself_is_let_through(tmp_path):
-    module = load_law(str(written(tmp_path, SLIDING)))
+    module = load_law(str(written(tmp_path, SLIDING))).module
     assert check([module]) == []
 
 
@@ -603,7 +603,7 @@ ALLOWED = {
 @pytest.mark.parametrize("name", ALLOWED)
 def test_what_is_proved_is_let_through(name, tmp_path):
     old, new = inserted(*ALLOWED[name])
-    assert check([load_law(str(written(tmp_path, SLIDING.replace(old, new, 1))))]) == []
+    assert check([load_law(str(written(tmp_path, SLIDING.replace(old, new, 1)))).module]) == []
 
 
 def test_several_mistakes_are_counted(tmp_path):
@@ -614,7 +614,7 @@ def test_several_mistakes_are_counted(tmp_path):
 
 @pytest.mark.parametrize("law", registry.law_names())
 def test_a_law_of_the_house_is_let_through(law):
-    assert check([load_law(law)]) == []
+    assert check([load_law(law).module]) == []
 
 
 def test_a_law_of_the_house_has_only_its_own_name(tmp_path):

@@ -201,8 +201,8 @@ def plot(path: Path, loaded: Loaded, rows: list[dict[str, Any]], keys: list[str]
     import matplotlib
     from matplotlib.figure import Figure
 
-    from ato_hil.tools.papers.style import defaults
     from ato_hil.tools.runs.files import write_bytes
+    from ato_hil.tools.runs.pictures import defaults
 
     picture = io.BytesIO()
     # The same file each time; what the user varies is no mathematics.

@@ -16,6 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from PIL import Image
 
 from ato_hil.tools.runs.folder import Folder
+from ato_hil.tools.runs.pictures import defaults
 
 COLUMN_IN, PAGE_IN = 3.5, 7.16  # width of one column, of two
 ROW_IN = 1.55  # height of one of several axes above each other
@@ -64,13 +65,6 @@ SETTINGS: Any = {
     "xtick.labelsize": 7.5,
     "ytick.labelsize": 7.5,
 }
-
-
-def defaults() -> Any:
-    """Matplotlib's own settings, without those of the user's matplotlibrc, which may ask for
-    LaTeX."""
-    own = matplotlib.rcParamsDefault
-    return {key: own[key] for key in own if not key.startswith("backend")}
 
 
 def settings() -> Any:

@@ -23,7 +23,7 @@ from ato_hil.tools.cli.output import (
     coloured,
     ignore_other_tools,
 )
-from ato_hil.tools.papers import style
+from ato_hil.tools.runs import pictures
 
 ROOT = Path(__file__).resolve().parents[2]
 PRINTABLE = st.text(st.characters(exclude_categories=["C", "Z"], exclude_characters="\u3164"))
@@ -150,4 +150,4 @@ def test_figures_take_nothing_of_the_users_matplotlibrc() -> None:
         with matplotlib.rc_context(style.settings()):
             assert not matplotlib.rcParams["text.usetex"]
             assert matplotlib.rcParams["lines.linewidth"] == style.SETTINGS["lines.linewidth"]
-        assert style.defaults()["text.usetex"] is False
+        assert pictures.defaults()["text.usetex"] is False
