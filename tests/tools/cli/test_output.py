@@ -23,6 +23,7 @@ from ato_hil.tools.cli.output import (
     coloured,
     ignore_other_tools,
 )
+from ato_hil.tools.papers import style
 from ato_hil.tools.runs import pictures
 
 ROOT = Path(__file__).resolve().parents[2]
