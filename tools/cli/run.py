@@ -22,8 +22,19 @@ from ato_hil.tools.cli.console import (
     one_line_for_bad_input,
     sigterm_as_ctrl_c,
 )
-from ato_hil.tools.cli.options import External, LawName, Mode, Pace, Runs, Seed, Viewer
+from ato_hil.tools.cli.options import (
+    DEFAULT_BOARD,
+    BoardName,
+    External,
+    LawName,
+    Mode,
+    Pace,
+    Runs,
+    Seed,
+    Viewer,
+)
 from ato_hil.tools.cli.output import console
+from ato_hil.tools.session import boards
 from ato_hil.tools.trace.live_viewer import LiveView
 
 if TYPE_CHECKING:
@@ -116,7 +127,8 @@ def run(
     mode: Annotated[
         Mode,
         typer.Option(
-            help="hil: processes on a bus; sil: one compiled loop; mil: interpreted, checked."
+            help="hil: processes on a bus; sil: one compiled loop; mil: interpreted, checked;"
+            " pil: on an emulated microcontroller."
         ),
     ] = Mode.hil,
     bus: Annotated[
@@ -163,8 +175,12 @@ def run(
     ] = None,
     firmware: Annotated[
         Path | None,
-        typer.Option(help="Library of `ato-hil export c` in place of the compiled Python."),
+        typer.Option(
+            help="Library of `ato-hil export c` in place of the compiled Python; PIL: image of"
+            " `ato-hil export image`, which is made if none is named."
+        ),
     ] = None,
+    board: Annotated[BoardName, typer.Option(help="PIL: the microcontroller.")] = DEFAULT_BOARD,
     view: Annotated[
         Viewer | None,
         typer.Option(
@@ -188,6 +204,13 @@ def run(
             if not trace:
                 raise fail("--view shows the trace, so not with --no-trace", EXIT_BAD_INPUT)
             viewer = stack.enter_context(LiveView(view.value))
+        if mode is Mode.pil and firmware is None:
+            from ato_hil.plant_sim.scenario import load
+            from ato_hil.tools.export import image
+
+            firmware = stack.enter_context(
+                image.built(load(scenario), law, boards.board_of(board.value))
+            )
         _run(
             Options(
                 scenario=scenario,
@@ -206,6 +229,7 @@ def run(
                 spin_us=spin_us,
                 viewer=viewer,
                 firmware=firmware,
+                board=board.value,
             ),
             Screen(mode),
         )
@@ -244,6 +268,8 @@ def _run(options: Options, screen: Screen) -> None:
     _print_table(screen)
     if External.plant in options.external:
         console.print("errors and energy are what the bus shows: measured, commanded")
+    if "target" in summary:
+        _print_target(summary["target"])
     if "timing" in summary:
         _print_timing(summary["timing"])
     repeats = "" if summary["digest_repeats"] else "   (in real time another one each time)"
@@ -271,6 +297,14 @@ def _wait_for(viewer: LiveView | None) -> None:
     if viewer is not None:
         with suppress(KeyboardInterrupt):
             viewer.wait()
+
+
+def _print_target(target: dict[str, Any]) -> None:
+    console.print(
+        f"board   {target['board']}, code for {target['core']}; a control period takes at most"
+        f" {target['instructions_most']} instructions, the stack {target['stack_bytes']} bytes",
+        soft_wrap=True,
+    )
 
 
 def _print_timing(timing: dict[str, Any]) -> None:

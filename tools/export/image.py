@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ato_hil.plant_sim.scenario import load, members
+from ato_hil.plant_sim.scenario import Loaded, members
 from ato_hil.tools.export import ExportError, firmware
 from ato_hil.tools.export.firmware import Firmware, Translated
 from ato_hil.tools.runs import onboard
@@ -31,10 +31,9 @@ LINKING = ("-nostdlib", "-Wl,--gc-sections", "-Wl,--fatal-warnings")
 OVERFLOW = re.compile(r"region `(\w+)' overflowed by (\d+) bytes")
 
 
-def sources(scenario: str, law: str | None) -> dict[str, str]:
+def sources(loaded: Loaded, law: str | None) -> dict[str, str]:
     """The exported C that an image is made of, by file name. Raises ExportError, or what loading
-    the scenario and the law raises."""
-    loaded = load(scenario)
+    the law raises."""
     law = law or loaded.scenario.law
     trains = members(loaded)
     made = Translated(
@@ -48,13 +47,13 @@ def sources(scenario: str, law: str | None) -> dict[str, str]:
     }
 
 
-def build(scenario: str, law: str | None, board: Board, out: Path) -> None:
+def build(loaded: Loaded, law: str | None, board: Board, out: Path) -> None:
     """Writes the image, whole or not at all. Raises as `sources`, and ExportError if there is no
     compiler or the board is too small."""
     compiler = shutil.which(COMPILER)
     if compiler is None:
         raise ExportError(f"{COMPILER} is not installed, try: apt-get install gcc-arm-none-eabi")
-    made = sources(scenario, law)
+    made = sources(loaded, law)
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch:
         folder = Path(scratch)
         for name, text in made.items():
@@ -68,7 +67,7 @@ def build(scenario: str, law: str | None, board: Board, out: Path) -> None:
         command += ["-lgcc", "-o", str(folder / "image.elf")]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            raise ExportError(_reason(scenario, board, done.stderr))
+            raise ExportError(_reason(loaded.name, board, done.stderr))
         try:
             fresh = out.with_name(f".{out.name}.new")
             shutil.copyfile(folder / "image.elf", fresh)
@@ -88,9 +87,9 @@ def _reason(scenario: str, board: Board, said: str) -> str:
 
 
 @contextmanager
-def built(scenario: str, law: str | None, board: Board) -> Iterator[Path]:
+def built(loaded: Loaded, law: str | None, board: Board) -> Iterator[Path]:
     """An image for as long as it is needed. Raises as `build`."""
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch:
         image = Path(scratch, "image.elf")
-        build(scenario, law, board, image)
+        build(loaded, law, board, image)
         yield image

@@ -41,7 +41,7 @@ from ato_hil.tools.session.processes import RunError
 EMULATOR = "qemu-system-arm"
 PROTOCOL = 1
 START = 0xA5
-ANSWER_S = 10  # for an answer of the image
+ANSWER_S = 10.0  # for an answer of the image
 END_S = 2.0  # for the emulator to end
 PROGRESS_TICKS = 500
 SHIFT = 6  # an instruction takes 2^SHIFT ns of the board's time: its SysTick counts instructions
@@ -104,8 +104,10 @@ class Target:
         self.name = "the image"
         # In the kernel, not in Python: the answer comes byte by byte, and is read at once.
         line.setblocking(True)
-        line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", ANSWER_S, 0))
-        line.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", ANSWER_S, 0))
+        seconds, microseconds = int(ANSWER_S), round(ANSWER_S % 1 * 1e6)
+        for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
+            timeval = struct.pack("@ll", seconds, microseconds)
+            line.setsockopt(socket.SOL_SOCKET, option, timeval)
 
     def call(self, kind: str, content: bytes) -> None:
         """Sends a block. Raises RunError if the emulator has ended or takes nothing."""
@@ -114,7 +116,7 @@ class Target:
         try:
             self.line.sendall(bytes([START]) + block + struct.pack("<H", crc))
         except BlockingIOError:
-            raise RunError(f"{self.name} takes no bytes for {ANSWER_S} s") from None
+            raise RunError(f"{self.name} takes no bytes for {ANSWER_S:g} s") from None
         except OSError:
             raise RunError(self._ended()) from None
 
@@ -131,7 +133,9 @@ class Target:
             raise RunError(f"{self.name} sends a block with a wrong CRC")
         if found == b"f":
             pc, lr = struct.unpack("<II", content)
-            raise RunError(f"{self.name} had a processor fault at {pc:#010x}, called from {lr:#x}")
+            if pc == 0:
+                raise RunError(f"{self.name} had a processor fault: its stack has run over")
+            raise RunError(f"{self.name} had a processor fault at {pc:#x}, called from {lr:#x}")
         if found == b"e":
             raise RunError(f"{self.name} refuses a block: {REFUSALS[content[0]]}")
         if found != kind.encode():
@@ -152,7 +156,7 @@ class Target:
             self.process.wait(0.2)
         if self.process.returncode is not None:
             raise RunError(self._ended())
-        raise RunError(f"{self.name} is silent: no answer within {ANSWER_S} s")
+        raise RunError(f"{self.name} is silent: no answer within {ANSWER_S:g} s")
 
     def _ended(self) -> str:
         with suppress(subprocess.TimeoutExpired):
@@ -178,7 +182,8 @@ class Target:
             raise BoardError(f"{self.name}: information of {len(information)} bytes, not {size}")
         _protocol, broken, cpuid, digest, memory_bytes, board = HELLO.unpack_from(content)
         if broken:
-            names = [what for k, what in enumerate(ASSUMPTIONS) if broken >> k & 1]
+            known = dict(enumerate(ASSUMPTIONS))
+            names = [known.get(k, f"assumption {k}") for k in range(32) if broken >> k & 1]
             raise BoardError(f"{self.name}: the target has not: {', '.join(names)}")
         return Hello(
             *(cpuid, digest, memory_bytes, board.rstrip(b"\0").decode(errors="replace")),
@@ -361,5 +366,20 @@ def _announce(here: world.World, started: list[Target], run_state: int, run: int
         sil.clear(here.tx[train])
         sil.clear(here.rx[train])
         plant.announce(here.state[train]["node"], run_state, run, here.tx[train])
-        target.send(0, here.tx[train])
-        target.receive(here.rx[train])
+        try:
+            target.send(0, here.tx[train])
+            target.receive(here.rx[train])
+        except RunError as error:
+            raise RunError(f"before or after run {run}: {error}") from None
+
+
+def about(started: list[Target], board: Board) -> dict[str, Any]:
+    """What summary.json says of the boards: most of all trains."""
+    states = [target.state() for target in started]
+    ticks = max(state.systick_most for state in states)
+    return {
+        "board": board.name,
+        "core": board.core,
+        "stack_bytes": max(state.stack_bytes for state in states),
+        "instructions_most": round(ticks * 1e9 / board.clock_hz / 2**SHIFT),
+    }

@@ -1,7 +1,8 @@
 """One session: the runs of one scenario and law in one mode, with their trace and summary.
 
 Modes: `sil` (one compiled loop), `mil` (the same loop interpreted, in a process started with
-ATO_HIL_INTERPRETED=1), `hil` (three processes on a bus). All give the same digest. In HIL
+ATO_HIL_INTERPRETED=1), `hil` (three processes on a bus), `pil` (the firmware's image on an emulated
+microcontroller). All give the same digest. In HIL
 plant or controller, or both, may be external: started by their owner, known by their frames alone.
 Only HIL can also go by the clock, pace `realtime`: its digest depends on what was in time.
 """
@@ -11,7 +12,7 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -48,6 +49,8 @@ from ato_hil.tools.runs.frames import LineDigest, timetable_rate
 from ato_hil.tools.runs.lyapunov import has_lyapunov, lyapunov
 from ato_hil.tools.runs.result import RunResult
 from ato_hil.tools.session import (
+    boards,
+    pil,
     processes,
     realtime,
     sil,
@@ -99,7 +102,7 @@ class Options:
     scenario: str
     law: str | None
     runs: int | None
-    mode: str  # hil | sil | mil
+    mode: str  # hil | sil | mil | pil
     bus: str
     seed: int
     out: Path
@@ -111,7 +114,8 @@ class Options:
     pace: str = LOCKSTEP
     spin_us: int = 0  # real time: busy wait of the plant before each deadline
     viewer: LiveView | None = None  # that looks on
-    firmware: Path | None = None  # library in place of the controller's compiled steps
+    firmware: Path | None = None  # library in place of the controller's compiled steps; PIL: image
+    board: str = boards.DEFAULT  # of PIL
 
 
 @dataclass(frozen=True)
@@ -219,8 +223,8 @@ def _faults(options: Options, file: Path, loaded: Loaded) -> Faults:
     """The faults that are asked for. Raises FaultError, SessionError."""
     if options.external:
         raise SessionError(f"{file}: faults are injected in nodes of ours, not in an external one")
-    if options.mode == "mil":
-        raise SessionError(f"{file}: faults need mode sil or hil, this is mil")
+    if options.mode not in ("sil", "hil"):
+        raise SessionError(f"{file}: faults need mode sil or hil, this is {options.mode}")
     asked = Faults(
         file,
         faults.load(file, options.seed, loaded.scenario.period_s),
@@ -277,7 +281,13 @@ def _controllers(options: Options, trains: list[Loaded]) -> tuple[str, list[Cali
     law = options.law or loaded.scenario.law
     load_law(law)
     calibrations = [onboard.calibration_for(train, law) for train in trains]
-    if options.firmware is not None:
+    if options.mode == "pil":
+        boards.board_of(options.board)
+        if options.firmware is None:
+            raise SessionError("mode pil needs an image of the firmware, as `export image` makes")
+        if options.memory is not None:
+            raise SessionError("mode pil takes no memory file: the image has its own memory")
+    elif options.firmware is not None:
         for calibration in calibrations:
             library.load(options.firmware, calibration)  # refuses what is not for this session
     learned = -1 if options.memory is None else node.last_iteration(calibrations[0], options.memory)
@@ -286,7 +296,8 @@ def _controllers(options: Options, trains: list[Loaded]) -> tuple[str, list[Cali
 
 def _words(options: Options, law: str, calibrations: list[Calibration]) -> tuple[str, ...]:
     """Names of the words of the learning memory, where it can be had: it is not on the bus."""
-    if len(calibrations) > 1 or (options.mode == "hil" and options.memory is None):
+    elsewhere = options.mode == "pil" or (options.mode == "hil" and options.memory is None)
+    if len(calibrations) > 1 or elsewhere:
         return ()
     stored = int(calibrations[0].params[0]["memory"]["words"])
     return tuple(f"{name} [{unit}]" for name, unit, _q in load_law(law).WORDS[:stored])
@@ -372,9 +383,9 @@ def _set_digest(session: Session, digest: str, of_trains: list[str]) -> None:
 def _run_in_process(session: Session) -> None:
     options, calibrations = session.options, session.calibrations
     digest = LineDigest(len(calibrations))
-    nodes = [
-        node.build(calibration, options.memory, options.firmware) for calibration in calibrations
-    ]
+    on_target = options.mode == "pil"
+    library_file = None if on_target else options.firmware
+    nodes = [node.build(calibration, options.memory, library_file) for calibration in calibrations]
     session.summary["controller"] = {
         "state_bytes": nodes[0].state_bytes,
         "memory_bytes": nodes[0].memory_bytes,
@@ -386,7 +397,11 @@ def _run_in_process(session: Session) -> None:
             stack.callback(_close_trace, session, writer)
             _look_on(session, writer.end_live)
         injected: list[faults.Event] = []
-        for results in _runs_in_process(session, nodes):
+        targets = stack.enter_context(_targets(session)) if on_target else []
+        made = _runs_on_target(session, targets) if targets else _runs_in_process(session, nodes)
+        for results in made:
+            if targets:
+                session.summary["target"] = pil.about(targets, boards.board_of(options.board))
             injected += faults.in_order([each for result in results for each in result.injected])
             if session.faults is not None:
                 _save_injected(session, injected)
@@ -430,6 +445,24 @@ def _runs_in_process(session: Session, nodes: list[node.Controller]) -> Iterator
         plan=session.faults.bus,
         fails=session.faults.plant,
         progress=progress,
+    )
+
+
+def _targets(session: Session) -> AbstractContextManager[list[pil.Target]]:
+    """The emulated boards, one for each train."""
+    options = session.options
+    assert options.firmware is not None  # _controllers refuses that
+    return pil.targets(options.firmware, boards.board_of(options.board), session.calibrations)
+
+
+def _runs_on_target(session: Session, targets: list[pil.Target]) -> Iterator[list[RunResult]]:
+    """The runs with the controllers on emulated boards."""
+    return pil.run_line(
+        session.loaded,
+        targets,
+        runs=session.runs,
+        seed=session.options.seed,
+        progress=session.listener.progress,
     )
 
 

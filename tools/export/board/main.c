@@ -7,7 +7,7 @@
  *     T period (1), frames             one call of ato_cycle        -> t frames
  *     S                                                             -> s state
  *     anything else, a wrong CRC                                    -> e reason (1)
- *     of its own accord, after a fault                              -> f pc (4), lr (4)
+ *     of its own accord, after a fault           -> f pc (4), lr (4); both 0: no stack is left
  *
  * A frame is its mailbox (1) and its eight bytes, which go as they are. */
 #include "ato.h"
@@ -285,7 +285,8 @@ static void tell_state(void)
     send('s');
 }
 
-/* `frame` is what the processor left on the stack: r0-r3, r12, lr, pc, xpsr. */
+/* `frame` is what the processor left on the stack: r0-r3, r12, lr, pc, xpsr. A stack that has run
+ * over lies below RAM, and there is no frame. */
 void fault_report(const uint32_t *frame)
 {
     uint32_t pc = 0u;
