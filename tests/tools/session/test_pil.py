@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from ato_hil.can_dbc.codec import mailboxes
+from ato_hil.controller import library
 from ato_hil.plant_sim.scenario import Loaded, load, members, shortened
 from ato_hil.tools.export import ExportError, image
 from ato_hil.tools.runs import onboard
@@ -177,7 +178,7 @@ def test_an_image_of_something_else(pid: Path, short: Loaded) -> None:
 def test_an_image_of_another_version(
     pid: Path, short: Loaded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pil.library, "source_digest", lambda _law: "newer")
+    monkeypatch.setattr(library, "source_digest", lambda _law: "newer")
     assert refused(pid, M4, short).endswith(", expected newer")
 
 

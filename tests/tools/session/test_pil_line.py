@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import binascii
 import io
+import shutil
 import socket
 import struct
 import subprocess
 from collections.abc import Iterator
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ato_hil.can_dbc.codec import MESSAGE_COUNT, mailboxes
+from ato_hil.controller import library
 from ato_hil.plant_sim.scenario import load
 from ato_hil.tools.export import ExportError, image
 from ato_hil.tools.session import pil
@@ -24,14 +25,18 @@ from ato_hil.tools.session.boards import BOARDS, BoardError, board_of
 from ato_hil.tools.session.processes import RunError
 
 
-class Process(SimpleNamespace):
+class Process(subprocess.Popen[bytes]):
     """Stands for the emulator."""
 
-    returncode: int | None = None
+    def __init__(self) -> None:
+        self.returncode = None  # type: ignore[assignment]
 
-    def wait(self, timeout: float) -> None:
+    def __del__(self) -> None: ...
+
+    def wait(self, timeout: float | None = None) -> int:
         if self.returncode is None:
-            raise subprocess.TimeoutExpired("emulator", timeout)
+            raise subprocess.TimeoutExpired("emulator", timeout or 0.0)
+        return self.returncode
 
 
 class Line:
@@ -140,7 +145,7 @@ def test_an_emulator_that_has_ended_is_named_with_its_last_words(line: Line) -> 
 
 def hello(protocol: int = pil.PROTOCOL, broken: int = 0) -> bytes:
     head = pil.HELLO.pack(protocol, broken, 0, 0, 0, b"mps2-an386")
-    return block("h", head + bytes(pil.library.Information()))
+    return block("h", head + bytes(library.Information()))
 
 
 @pytest.mark.parametrize(
@@ -181,7 +186,7 @@ def test_every_assumption_has_a_name() -> None:
 
 
 def test_no_emulator(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
-    monkeypatch.setattr(pil.shutil, "which", lambda _name: None)
+    monkeypatch.setattr(shutil, "which", lambda _name: None)
     with (
         pytest.raises(BoardError, match=r"^qemu-system-arm is not installed, try: apt-get inst"),
         pil.emulated(tmp_path / "image.elf", BOARDS["mps2-an386"]),
@@ -190,7 +195,7 @@ def test_no_emulator(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
 
 
 def test_no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
-    monkeypatch.setattr(image.shutil, "which", lambda _name: None)
+    monkeypatch.setattr(shutil, "which", lambda _name: None)
     with pytest.raises(ExportError, match=r"^arm-none-eabi-gcc is not installed, try: apt-get in"):
         image.build(load("subway"), None, BOARDS["mps2-an386"], tmp_path / "image.elf")
 
