@@ -1,4 +1,7 @@
-"""The example in C in the place of our controller, on a real vcan: `make test-socketcan` builds it."""
+"""The example in C in the place of our controller, on a real vcan.
+
+`make test-socketcan` builds it.
+"""
 
 import os
 import subprocess

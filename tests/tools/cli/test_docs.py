@@ -40,7 +40,7 @@ def test_every_signal_and_every_option_is_there() -> None:
         for signal in message.signals:
             assert (f"| {signal.name} |" in section) == (signal.name not in docs.PROTECTION)
     commands = docs.command_line()
-    for text in ("--mode {hil,sil,mil} | ".replace(" | ", "` | `hil`"), "`--trace/--no-trace`"):
+    for text in ("--mode {hil,sil,mil,pil} | ".replace(" | ", "` | `hil`"), "`--trace/--no-trace`"):
         assert text in commands
     assert "| `[LAWS...]` |" in commands
     assert "    ato-hil replay FILE [OPTIONS]\n" in commands
@@ -126,8 +126,13 @@ def test_commands_in_the_docs_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for command, options in re.findall(r"^ *(?:`)?ato-hil ([a-z-]+)([^`#\n]*)", text, re.M):
         assert command in known, f"{page.name}: ato-hil {command}"
-        taken = {name for each in known[command].params for name in each.opts}
-        taken |= {name for each in known[command].params for name in each.secondary_opts}
+        named = known[command]
+        if hasattr(named, "commands"):  # a group: its command comes next
+            inner = options.split()[0]
+            assert inner in named.commands, f"{page.name}: ato-hil {command} {inner}"
+            named = named.commands[inner]
+        taken = {name for each in named.params for name in each.opts}
+        taken |= {name for each in named.params for name in each.secondary_opts}
         for option in re.findall(r"(?<!\S)--[a-z-]+", options):
             assert option in taken, f"{page.name}: ato-hil {command} {option}"
 

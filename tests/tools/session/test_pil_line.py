@@ -29,7 +29,7 @@ class Process(subprocess.Popen[bytes]):
     """Stands for the emulator."""
 
     def __init__(self) -> None:
-        self.returncode = None  # type: ignore[assignment]
+        self.returncode = None
 
     def __del__(self) -> None: ...
 
