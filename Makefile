@@ -41,7 +41,7 @@ test-socketcan: $(DEV_READY) ## pass the tests on SocketCAN, in user-mode Linux,
 	$(install_guest)
 	.venv/bin/ato-hil run tests/uml/short.toml --bus hub:uml --out runs/test-socketcan
 	.venv/bin/ato-hil export c tests/uml/short.toml --out runs/test-socketcan/ato
-	make -s -C examples/linux_can EXPORT="$(CURDIR)/runs/test-socketcan/ato" OUT="$(CURDIR)/runs/test-socketcan"
+	$(MAKE) -s -C examples/linux_can EXPORT="$(CURDIR)/runs/test-socketcan/ato" OUT="$(CURDIR)/runs/test-socketcan"
 	.venv/bin/python tests/python_can_tests.py runs/test-socketcan
 	.venv/bin/python tests/uml/guest.py --limit $(GUEST_LIMIT_S) \
 		.venv/bin/python -m pytest -v -p no:cacheprovider -m uml $(PYTEST_ARGS) tests/uml
