@@ -25,7 +25,7 @@ help: ## list the targets
 	sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 23
 
 hil: $(RUN_READY) ## set up and run the main job: SCENARIO=subway RUNS=10, traces in runs/
-	.venv/bin/ato-hil run "$(SCENARIO)" --mode hil --runs "$(RUNS)" --out "runs/$(SCENARIO)"
+	.venv/bin/ato-hil run "$(SCENARIO)" --mode hil --runs "$(RUNS)" --out "runs/$(SCENARIO)" --overwrite
 	echo
 	echo "Trace: runs/$(SCENARIO)/trace.rrd"
 	echo "Open:  .venv/bin/ato-hil view runs/$(SCENARIO)"
@@ -39,7 +39,7 @@ long: $(DEV_READY) ## pass the long tests
 # The guest is slow: what it runs is compiled here first.
 test-socketcan: $(DEV_READY) ## pass the tests on SocketCAN, in user-mode Linux, and measure it there
 	$(install_guest)
-	.venv/bin/ato-hil run tests/uml/short.toml --bus hub:uml --out runs/test-socketcan
+	.venv/bin/ato-hil run tests/uml/short.toml --bus hub:uml --out runs/test-socketcan --overwrite
 	.venv/bin/ato-hil export c tests/uml/short.toml --out runs/test-socketcan/ato
 	$(MAKE) -s -C examples/linux_can EXPORT="$(CURDIR)/runs/test-socketcan/ato" OUT="$(CURDIR)/runs/test-socketcan"
 	.venv/bin/python tests/python_can_tests.py runs/test-socketcan
@@ -59,7 +59,7 @@ golden: $(RUN_READY) ## write new golden digests (tools/verify/golden.json) and 
 	.venv/bin/ato-hil verify --renew-golden $(LAWS)
 
 pareto: $(RUN_READY) ## draw docs/pareto.png again: energy against error in paper 5
-	.venv/bin/ato-hil sweep gradient-paper:VI --vary law.L=1,5 --vary law.S=0,0.1,0.25,0.5,1,2,4 --out runs/pareto
+	.venv/bin/ato-hil sweep gradient-paper:VI --vary law.L=1,5 --vary law.S=0,0.1,0.25,0.5,1,2,4 --out runs/pareto --overwrite
 	cp runs/pareto/pareto.png docs/pareto.png
 
 # Where two lines draw the same figure, the later one stays. The traces take a gigabyte.
@@ -105,9 +105,9 @@ docs: $(RUN_READY) ## write docs/messages.md and docs/command-line.md again, fro
 # The viewer draws them without a screen, with Vulkan in software: mesa-vulkan-drivers is for this.
 pictures: $(RUN_READY) ## draw the screenshots of the viewer in docs/ again
 	for law in cailc ailc; do
-		.venv/bin/ato-hil run subway --law "$$law" --mode sil --runs 5 --out "runs/pictures/$$law"
+		.venv/bin/ato-hil run subway --law "$$law" --mode sil --runs 5 --out "runs/pictures/$$law" --overwrite
 	done
-	.venv/bin/ato-hil run line --mode sil --runs 1 --out runs/pictures/line
+	.venv/bin/ato-hil run line --mode sil --runs 1 --out runs/pictures/line --overwrite
 	.venv/bin/ato-hil view runs/pictures/cailc --screenshot docs/trace.png
 	.venv/bin/ato-hil view runs/pictures/cailc --tab learning --screenshot docs/trace-learning.png
 	.venv/bin/ato-hil view runs/pictures/cailc --tab bus --screenshot docs/trace-bus.png

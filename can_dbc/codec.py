@@ -169,6 +169,16 @@ def choices(message: str, signal: str) -> dict[str, int]:
     return {str(name): int(value) for value, name in table.items()}
 
 
+def values(message: str, signal: str, names: str) -> list[int]:
+    """Raw values of some names of a signal's value table, which a space parts. Raises DbcError if
+    the DBC lacks one."""
+    table = choices(message, signal)
+    for name in names.split():
+        if name not in table:
+            raise DbcError(f"{dbc_path()}: {message}.{signal} has no value {name}")
+    return [table[name] for name in names.split()]
+
+
 def binary_exponent(message: Any, signal: str) -> int:
     """n where the signal's scale is 2**-n: the firmware converts by shifts. Raises DbcError
     otherwise."""

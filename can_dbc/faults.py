@@ -43,7 +43,7 @@ from ato_hil.can_dbc.codec import (
     database,
     word_of,
 )
-from ato_hil.can_dbc.errors import InputError
+from ato_hil.can_dbc.errors import InputError, expected, validation
 
 CONTROLLER, PLANT = "controller", "plant"
 RECEIVERS = (PLANT, CONTROLLER)
@@ -181,7 +181,7 @@ class Silence(BusFault, frozen=True, kw_only=True, tag_field="kind", tag="silenc
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.node not in _senders():
-            raise ValueError(f"node is {self.node!r}, expected one of {', '.join(_senders())}")
+            raise ValueError(f"node is {self.node!r}, {expected(self.node, _senders())}")
 
 
 class Babble(BusFault, frozen=True, kw_only=True, tag_field="kind", tag="babble"):
@@ -266,9 +266,9 @@ def load_signals(path: Path, nodes: Collection[str], period_s: float) -> list[Pr
     signals = []
     for number, each in enumerate(table(path, "process", ProcessEntry), start=1):
         if each.node not in nodes:
-            known = ", ".join(nodes)
             raise FaultError(
-                f"{path}: key process[{number - 1}]: node is {each.node!r}, expected one of {known}"
+                f"{path}: key process[{number - 1}]: node is {each.node!r},"
+                f" {expected(each.node, nodes)}"
             )
         tick = ceil(round(each.at_s / period_s, 6))
         signals.append(ProcessFault(each.run, tick, each.node, each.signal, number))
@@ -285,15 +285,16 @@ def table(path: Path, name: str, kind: Any) -> list[Any]:
         raise FaultError(f"{path}: cannot be read: {error.strerror}") from None
     for key in content:
         if key not in TABLES:
-            known = ", ".join(f"[[{each}]]" for each in TABLES)
-            raise FaultError(f"{path}: key {key}: expected one of {known}")
+            known = expected(f"[[{key}]]", (f"[[{each}]]" for each in TABLES))
+            raise FaultError(f"{path}: key {key}: {known}")
     try:
         entries: list[Any] = msgspec.convert(content.get(name, []), list[kind])
     except msgspec.ValidationError as error:
-        text, _, place = str(error).partition(" - at `$")
-        if place.endswith(".kind`"):
-            text += f", expected one of {', '.join(_kinds(kind))}"
-        raise FaultError(f"{path}: key {name}{place.rstrip('`')}: {text}") from None
+        text, place = validation(error, list[kind])
+        if place.endswith(".kind"):
+            given = text.partition("'")[2].rstrip("'")
+            text += f", {expected(given, _kinds(kind))}"
+        raise FaultError(f"{path}: key {name}{place}: {text}") from None
     return entries
 
 
@@ -350,7 +351,7 @@ def _senders() -> dict[str, frozenset[int]]:
 
 def _known(name: int | str | None) -> None:
     if isinstance(name, str) and name not in _BY_NAME:
-        raise ValueError(f"message {name!r} is unknown, expected one of {', '.join(_BY_NAME)}")
+        raise ValueError(f"message {name!r} is unknown, {expected(name, _BY_NAME)}")
 
 
 def _identifiers(names: tuple[str, ...]) -> frozenset[int]:
@@ -364,8 +365,8 @@ def _identifiers(names: tuple[str, ...]) -> frozenset[int]:
         elif name in _senders():
             found |= _senders()[name]
         else:
-            known = ", ".join((*_senders(), *_BY_NAME))
-            raise ValueError(f"messages: {name!r} is unknown, expected one of {known}")
+            known = expected(name, (*_senders(), *_BY_NAME))
+            raise ValueError(f"messages: {name!r} is unknown, {known}")
     return frozenset(found)
 
 

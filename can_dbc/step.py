@@ -110,6 +110,11 @@ for _name in ("neg", "pos", "abs", "invert"):
 
 int64: Any = Checked if INTERPRETED else numba.int64
 
+# What the arguments of a step are called; the compiler asks the values themselves.
+Int = int  # of at most 64 bits: int64 between records
+Record = Any  # one record of a structured dtype, its fields as attributes
+Array = Any  # an array of records or integers, by index
+
 
 def dbc_path() -> Path:
     """The DBC in force: the packaged one, or the file that ATO_HIL_DBC names."""

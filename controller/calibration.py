@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc.errors import validation
 from ato_hil.controller import (
     distribution,
     firmware,
@@ -45,6 +46,7 @@ from ato_hil.controller.quantise import (
     fixed,
 )
 from ato_hil.controller.registry import (
+    Law,
     is_file,
     law_label,
     law_number,
@@ -146,20 +148,23 @@ def calibrate(
 ) -> Calibration:
     """PARAMS of the firmware for one law on one scenario. Raises CalibrationError or LawError with
     one line."""
-    module = load_law(law)
-    params = np.zeros(1, firmware.params_dtype(module.PARAMS))
-    params["core"] = _core(module, law, vehicle)
+    known = load_law(law)
+    params = np.zeros(1, firmware.params_dtype(known.PARAMS))
+    params["core"] = _core(known, law, vehicle)
     try:
-        typed = msgspec.convert(gains, module.Gains)
+        typed = msgspec.convert(gains, known.Gains)
         with np.errstate(invalid="raise"):  # a float that no integer holds
-            params["law"] = _law(module, module.calibrate(typed, vehicle))
-            words = _words(module, typed, vehicle)
-        recall = _recalled(module, typed, int(words["words"][0]))
-        pitch_m = _pitch_m(module, typed)
-    except (msgspec.ValidationError, CalibrationError) as error:
+            params["law"] = _law(known, known.calibrate(typed, vehicle))
+            words = _words(known, typed, vehicle)
+        recall = _recalled(known, typed, int(words["words"][0]))
+        pitch_m = _pitch_m(known, typed)
+    except msgspec.ValidationError as error:
+        text, where = validation(error, known.Gains)
+        raise CalibrationError(f"laws.{law_label(law)}{where}: {text}") from None
+    except CalibrationError as error:
         raise CalibrationError(f"laws.{law_label(law)}: {error}") from None
     except Exception as error:  # whatever the law's own Python does
-        where = place(Path(law) if is_file(law) else Path(module.__file__ or ""), error)
+        where = place(Path(law) if is_file(law) else Path(known.module.__file__ or ""), error)
         raise CalibrationError(f"laws.{law_label(law)}: {where}") from None
     params["gradient_map"] = gradient_map.calibrate(map_sections)
     params["guard"] = _guard(guard_settings, vehicle.period_s)
@@ -322,34 +327,34 @@ def _whole(key: str, value: int, low: int, high: int) -> int:
     return value
 
 
-def _core(module: Any, law: str, vehicle: Vehicle) -> np.ndarray:
+def _core(law: Law, name: str, vehicle: Vehicle) -> np.ndarray:
     if not vehicle.mass_kg > 0:
         raise CalibrationError(f"mass_kg is {vehicle.mass_kg:g}, expected more than 0")
     core = np.zeros(1, firmware.CORE_PARAMS)
     core["mass"] = fixed("mass_kg", vehicle.mass_kg, Q_FORCE)
-    core["law"] = law_number(law)
-    core["estimates"] = len(module.ESTIMATES)
-    for index, (_name, _unit, q) in enumerate(module.ESTIMATES):
+    core["law"] = law_number(name)
+    core["estimates"] = len(law.ESTIMATES)
+    for index, (_name, _unit, q) in enumerate(law.ESTIMATES):
         core["exponent"][0, index] = q
     return core
 
 
-def _law(module: Any, params: Any) -> np.ndarray:
+def _law(law: Law, params: Any) -> np.ndarray:
     """What `calibrate` of a law gave, if that is PARAMS."""
-    if isinstance(params, np.ndarray) and params.dtype == module.PARAMS and params.shape == (1,):
+    if isinstance(params, np.ndarray) and params.dtype == law.PARAMS and params.shape == (1,):
         return params
     given = type(params).__name__
     if isinstance(params, np.ndarray):
-        record = "PARAMS" if params.dtype == module.PARAMS else "another type"
+        record = "PARAMS" if params.dtype == law.PARAMS else "another type"
         given = f"{record}, shape {params.shape}"
     raise CalibrationError(f"calibrate returns {given}, expected PARAMS, shape (1,)")
 
 
-def _recalled(module: Any, gains: Any, words: int) -> Recall | None:
+def _recalled(law: Law, gains: Any, words: int) -> Recall | None:
     """What a law sees of the last run, if it does: within the words that it stores."""
-    if not hasattr(module, "recall"):
+    found = law.recall(gains)
+    if found is None:
         return None
-    found: Recall = module.recall(gains)
     if not isinstance(found, Recall):
         raise CalibrationError(f"recall returns {found!r}, expected a Recall")
     _whole("recall: smooth_word", found.smooth_word, 0, words - 1)
@@ -358,11 +363,12 @@ def _recalled(module: Any, gains: Any, words: int) -> Recall | None:
     return found
 
 
-def _pitch_m(module: Any, gains: Any) -> float | None:
+def _pitch_m(law: Law, gains: Any) -> float | None:
     """Length of a cell of a law that learns along the track, at least 1 m."""
-    if not hasattr(module, "pitch_m"):
+    given = law.pitch_m(gains)
+    if given is None:
         return None
-    found = float(module.pitch_m(gains))
+    found = float(given)
     if not 1 <= found < float("inf"):
         raise CalibrationError(f"pitch_m is {found:g}, expected 1 or more")
     return found
@@ -380,29 +386,27 @@ def _reference(period_s: float, profile: np.ndarray, preview_ticks: int) -> np.n
     return params
 
 
-def _words(module: Any, gains: Any, vehicle: Vehicle) -> np.ndarray:
+def _words(law: Law, gains: Any, vehicle: Vehicle) -> np.ndarray:
     """MEMORY_PARAMS with what the law says of its words."""
     params = np.zeros(1, memory.MEMORY_PARAMS)
-    if not module.WORDS:
+    if not law.WORDS:
         return params
-    initial, low, high = module.learned(gains, vehicle)
+    initial, low, high = law.learned(gains, vehicle)
     words = len(initial)
-    if not 1 <= words <= len(module.WORDS) or not words == len(low) == len(high):
+    if not 1 <= words <= len(law.WORDS) or not words == len(low) == len(high):
         lengths = f"{words}, {len(low)}, {len(high)}"
         raise CalibrationError(
-            f"learned returns {lengths} values, expected three times 1 to {len(module.WORDS)}"
+            f"learned returns {lengths} values, expected three times 1 to {len(law.WORDS)}"
         )
-    for (name, _unit, _q), at, lowest, highest in zip(
-        module.WORDS, initial, low, high, strict=False
-    ):
+    for (name, _unit, _q), at, lowest, highest in zip(law.WORDS, initial, low, high, strict=False):
         if not INT32_MIN <= lowest <= at <= highest <= INT32_MAX:
             raise CalibrationError(
                 f"learned: {name} begins at {at}, between {lowest} and {highest}; expected low <="
                 " initial <= high in 32 bits"
             )
+    stored = law.words_stored(gains)
     # A law whose gains learn only its first words stores only these; the others keep their value.
-    stored = getattr(module, "words_stored", lambda _: words)(gains)
-    params["words"] = _whole("words_stored", stored, 1, words)
+    params["words"] = words if stored is None else _whole("words_stored", stored, 1, words)
     params["initial"][0, :words] = initial
     params["low"][0, :words] = low
     params["high"][0, :words] = high

@@ -11,11 +11,14 @@ Contract: steps of bounded time, one division above the speed where the power ca
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.q import INT32_MAX, round_shift
 from ato_hil.controller.quantise import Vehicle, fixed
 
@@ -52,7 +55,7 @@ def calibrate(vehicle: Vehicle) -> np.ndarray:
 
 
 @step
-def largest_force(params: Any, speed: Any) -> Any:
+def largest_force(params: Record, speed: Int) -> Int:
     """f_max at a measured speed (Q24), m/s^2, Q27."""
     forward = max(speed, int64(0))
     most = int64(params.force) - round_shift(int64(params.slope) * forward, 33)

@@ -20,11 +20,16 @@ paper's train. No car ever leaves its limits.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Array,
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.q import Q_FORCE, round_shift, sat32
 from ato_hil.controller.quantise import CalibrationError
 
@@ -126,7 +131,7 @@ def _rows(mu: list[float], limits: list[int]) -> np.ndarray:
 
 
 @step
-def distribute(params: Any, force: Any, car_force: Any) -> Any:
+def distribute(params: Record, force: Int, car_force: Array) -> Int:
     """car_force[k] for the total force, both N Q4, nothing if no car gets a force of its own; the
     total that the cars give."""
     if int64(params.cars) > 0:

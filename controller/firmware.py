@@ -3,10 +3,10 @@
 Contract of `tick(params, profile, state, memory, rx, tx, period)`: a step. It reads `rx`
 (mailboxes, cleared by the caller after the tick), `params`, `profile`; writes `state`, `memory`,
 `tx`; takes bounded time; never raises, whatever is in the mailboxes. `period` is 1 when a control
-period has passed, 0 to look at RUN_CTRL alone. In order: decode and end-to-end check, ages, the
-onboard reference, the neighbours and what they make of it, the law, the guard, distribution over
-the cars, encode and protect. The process around it moves payloads and stores the learning memory,
-nothing else.
+period has passed, 0 to look at RUN_CTRL alone. In order: `before_law` (decode and end-to-end check,
+ages, the onboard reference, the neighbours and what they make of it), the law, `after_law` (the
+guard, distribution over the cars, encode and protect). The process around it moves payloads and
+stores the learning memory, nothing else.
 """
 
 from __future__ import annotations
@@ -40,7 +40,13 @@ from ato_hil.can_dbc.codec import (
     put,
     saturate,
 )
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Array,
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller import (
     distribution,
     gradient_map,
@@ -179,7 +185,7 @@ def state_dtype(law_state: np.dtype) -> np.dtype:
 
 
 @step
-def begin(params: Any, profile: Any, state: Any, cells: Any, rate: Any) -> None:
+def begin(params: Record, profile: Array, state: Record, cells: Array, rate: Int) -> None:
     """State of a new run: reference at its start, counters at 0, no fault; the learning memory
     stays. `rate` of its timetable, less 1, Q24."""
     core = state.core
@@ -208,7 +214,7 @@ def begin(params: Any, profile: Any, state: Any, cells: Any, rate: Any) -> None:
 
 
 @step
-def status_word(params: Any, core: Any) -> Any:
+def status_word(params: Record, core: Record) -> Int:
     """ATO_STATUS."""
     return (
         put(ATO_STATUS.Law, int64(params.core.law))
@@ -220,7 +226,7 @@ def status_word(params: Any, core: Any) -> Any:
 
 
 @step
-def tracking_word(inputs: Any) -> Any:
+def tracking_word(inputs: Record) -> Int:
     """ATO_TRACKING: errors as the controller sees them, saturated to their signals."""
     position_error = int64(inputs.position) - int64(inputs.reference_position)
     speed_error = int64(inputs.speed) - int64(inputs.reference_speed)
@@ -234,20 +240,20 @@ def tracking_word(inputs: Any) -> Any:
 
 
 @step
-def receive(setting: Any, state: Any, rx: Any, message: Any) -> Any:
+def receive(setting: Int, state: Record, rx: Array, message: Record) -> Int:
     """1 if the message has come and its value counts."""
     return e2e.receive(setting, state.links[message.index], rx[message.index], message.data_id)
 
 
 @step
-def stamp_age(core: Any) -> Any:
+def stamp_age(core: Record) -> Int:
     """Ticks since the plant measured the position, by its Tick; 0 if that lies ahead."""
     age = (int64(core.tick) - int64(core.stamp)) & TICK_MASK
     return age if age <= TICK_MASK >> 1 else int64(0)
 
 
 @step
-def position_now(params: Any, core: Any, speed: Any) -> Any:
+def position_now(params: Record, core: Record, speed: Int) -> Int:
     """Where the train is by dead reckoning: the last measured position, m, Q15, and the way since
     it was measured, at the present speed, Q24. A frame may be missing, or come late."""
     way_per_tick = (speed * int64(params.guard.period)) >> 30  # m, Q24
@@ -256,7 +262,7 @@ def position_now(params: Any, core: Any, speed: Any) -> Any:
 
 
 @step
-def read_inputs(params: Any, state: Any, rx: Any) -> None:
+def read_inputs(params: Record, state: Record, rx: Array) -> None:
     """Measurements, limit and tick from the mailboxes that pass their check; the others keep their
     last value, but for the position, which goes on."""
     core = state.core
@@ -300,7 +306,7 @@ def read_inputs(params: Any, state: Any, rx: Any) -> None:
 
 
 @step
-def read_reference(params: Any, state: Any) -> None:
+def read_reference(params: Record, state: Record) -> None:
     """The onboard reference now and `preview` ticks ahead."""
     inputs = state.inputs
     start = int64(params.neighbours.start)
@@ -313,7 +319,9 @@ def read_reference(params: Any, state: Any) -> None:
 
 
 @step
-def read_neighbour(params: Any, state: Any, rx: Any, side: Any, position: Any, motion: Any) -> None:
+def read_neighbour(
+    params: Record, state: Record, rx: Array, side: Int, position: Record, motion: Record
+) -> None:
     """The two frames of a neighbour, if both of this tick pass their check and neither link is
     invalid."""
     passed = receive(params.slow, state, rx, position)
@@ -337,7 +345,7 @@ def read_neighbour(params: Any, state: Any, rx: Any, side: Any, position: Any, m
 
 
 @step
-def read_line(params: Any, state: Any, rx: Any) -> Any:
+def read_line(params: Record, state: Record, rx: Array) -> Int:
     """The neighbours as they are now, and the reference that the train follows because of them;
     fault bits."""
     core = state.core
@@ -359,7 +367,7 @@ def read_line(params: Any, state: Any, rx: Any) -> Any:
 
 
 @step
-def radio_word(state: Any) -> Any:
+def radio_word(state: Record) -> Int:
     """ATO_RADIO."""
     own = state.rebasing
     sides = state.neighbours.side
@@ -375,7 +383,7 @@ def radio_word(state: Any) -> Any:
 
 
 @step
-def read_map(params: Any, state: Any) -> None:
+def read_map(params: Record, state: Record) -> None:
     """What the gradient map says where the train is."""
     position = int64(state.inputs.position)
     section = gradient_map.read(params.gradient_map, int64(state.core.map_section), position)
@@ -386,7 +394,7 @@ def read_map(params: Any, state: Any) -> None:
 
 
 @step
-def car_words(core: Any, tx: Any, cars: Any) -> None:
+def car_words(core: Record, tx: Array, cars: Int) -> None:
     """CAR_FORCE_1 to CAR_FORCE_4, two cars a frame, as many as there are cars."""
     if cars > 0:
         e2e.send(
@@ -423,7 +431,7 @@ def car_words(core: Any, tx: Any, cars: Any) -> None:
 
 
 @step
-def mode_of(reaction: Any, force: Any) -> Any:
+def mode_of(reaction: Int, force: Int) -> Int:
     """Mode of FORCE_CMD: what the guard asks for, else the sign of the force."""
     if reaction == GUARD_EMERGENCY:
         return int64(EMERGENCY_REQUEST)
@@ -437,12 +445,129 @@ def mode_of(reaction: Any, force: Any) -> Any:
 
 
 @step
-def estimate_word(index: Any, exponent: Any, value: Any) -> Any:
+def estimate_word(index: Int, exponent: Int, value: Int) -> Int:
     """ATO_ESTIMATE; the multiplexed signals share one place."""
     return (
         put(ATO_ESTIMATE.Index, index)
         + put(ATO_ESTIMATE.Exponent, exponent)
         + put(ATO_ESTIMATE.Estimate0, value)
+    )
+
+
+@step
+def run_control(
+    params: Record, profile: Array, state: Record, cells: Array, rx: Array, tx: Array
+) -> None:
+    """Follows RUN_CTRL, if it has come: run state, iteration, the start of a run."""
+    core = state.core
+    if receive(params.slow, state, rx, RUN_CTRL) != 0:
+        word = int64(rx[RUN_CTRL.index].payload)
+        wanted = get(word, RUN_CTRL.RunState)
+        if wanted > ENDED:
+            wanted = int64(IDLE)
+        if wanted == RUNNING:
+            # A run starts only from armed: a controller that restarts inside a run stays silent.
+            if int64(core.run_state) == ARMED:
+                core.run_state = RUNNING
+        else:
+            core.run_state = wanted
+            core.iteration = get(word, RUN_CTRL.Iteration)
+            if wanted == ARMED:
+                rate = get(word, RUN_CTRL.TimetableRate) << _RATE_SHIFT
+                begin(params, profile, state, cells, rate)
+            e2e.send(core, tx, ATO_STATUS, status_word(params, core))
+
+
+@step
+def before_law(
+    params: Record, profile: Array, state: Record, cells: Array, rx: Array, tx: Array, period: Int
+) -> Int:
+    """All that a tick does up to the law: `state.inputs` and `state.cell` are then what the law
+    reads. 1 if the law runs in this tick, 0 if nothing is left to do."""
+    run_control(params, profile, state, cells, rx, tx)
+    core = state.core
+    inputs = state.inputs
+    if int64(core.run_state) != RUNNING or period != 1:
+        return int64(0)
+    read_inputs(params, state, rx)
+    inputs.tick = core.tick
+    inputs.iteration = core.iteration
+    read_reference(params, state)
+    if neighbours.any_exist(params.neighbours) != 0:
+        core.faults = int64(core.faults) | read_line(params, state, rx)
+    read_map(params, state)
+    stands = int64(inputs.reference_speed) == 0 and int64(inputs.ahead_speed) == 0
+    state.seen.timetable_stands = 1 if stands else 0
+    memory.gather(params.memory, state.memory, cells, state.cell, int64(inputs.position))
+    return int64(1)
+
+
+@step
+def after_law(params: Record, profile: Array, state: Record, cells: Array, tx: Array) -> None:
+    """All that a tick does with what the law left in `state.outputs` and `state.cell`: learning
+    memory, guard, distribution over the cars, frames; then the reference goes on by a tick."""
+    core = state.core
+    memory.scatter(params.memory, state.memory, cells, state.cell)
+    command(params, state)
+    send(params, state, tx)
+    reference.advance(params.reference, state.cursor, profile)
+    reference.advance(params.reference, state.ahead, profile)
+    core.tick = int64(core.tick) + 1
+
+
+@step
+def command(params: Record, state: Record) -> None:
+    """What the guard leaves of the law's force, in whole units of FORCE_CMD and shared out over the
+    cars; faults and guard state."""
+    core = state.core
+    faults = (
+        int64(core.faults)
+        | int64(state.outputs.status)
+        | guard.faults_of_inputs(params.guard, state.seen)
+        | guard.faults_of_motion(params.guard, state.seen)
+    )
+    core.faults = faults
+    core.guard = guard.state_of(params.guard, state.guard, state.seen, faults)
+    wanted = int64(state.outputs.force)
+    specific = guard.limited(params.guard, state.guard, state.seen, int64(core.guard), wanted)
+    asked = round_shift(specific * int64(params.core.mass), Q_ACCELERATION) >> _FORCE_SHIFT
+    force = saturate(FORCE_CMD.Force, asked) << _FORCE_SHIFT
+    force = distribution.distribute(params.distribution, force, core.car_force)
+    limited = specific != wanted or force >> _FORCE_SHIFT != asked
+    state.inputs.limited = 1 if limited else 0
+    core.force = force
+
+
+@step
+def send(params: Record, state: Record, tx: Array) -> None:
+    """The frames of a tick of a run; FORCE_CMD is the last, who waits for it has them all."""
+    core = state.core
+    tick = int64(core.tick)
+    car_words(core, tx, int64(params.distribution.cars))
+    phase = tick % STATUS_PERIOD
+    if phase == 0:
+        e2e.send(core, tx, ATO_STATUS, status_word(params, core))
+        e2e.send(core, tx, ATO_TRACKING, tracking_word(state.inputs))
+    if phase < int64(params.core.estimates):
+        e2e.send(
+            core,
+            tx,
+            ATO_ESTIMATE,
+            estimate_word(
+                phase,
+                int64(params.core.exponent[phase]),
+                int64(state.outputs.estimate[phase]),
+            ),
+        )
+    if phase == 0 and neighbours.any_exist(params.neighbours) != 0:
+        e2e.send(core, tx, ATO_RADIO, radio_word(state))
+    e2e.send(
+        core,
+        tx,
+        FORCE_CMD,
+        put(FORCE_CMD.Force, int64(core.force) >> _FORCE_SHIFT)
+        + put(FORCE_CMD.Mode, mode_of(int64(core.guard), int64(core.force)))
+        + put(FORCE_CMD.Tick, tick & TICK_MASK),
     )
 
 
@@ -455,95 +580,11 @@ def build_tick(law_step: Any) -> Any:
     """
 
     @step
-    def run_tick(params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any) -> None:
-        core = state.core
-        inputs = state.inputs
-        inputs.tick = core.tick
-        inputs.iteration = core.iteration
-        read_reference(params, state)
-        has_neighbours = neighbours.any_exist(params.neighbours) != 0
-        if has_neighbours:
-            core.faults = int64(core.faults) | read_line(params, state, rx)
-        read_map(params, state)
-        stands = int64(inputs.reference_speed) == 0 and int64(inputs.ahead_speed) == 0
-        state.seen.timetable_stands = 1 if stands else 0
-
-        memory.gather(params.memory, state.memory, cells, state.cell, int64(inputs.position))
-        law_step(params.law, state.law, state.cell, inputs, state.outputs)
-        memory.scatter(params.memory, state.memory, cells, state.cell)
-
-        faults = (
-            int64(core.faults)
-            | int64(state.outputs.status)
-            | guard.faults_of_inputs(params.guard, state.seen)
-            | guard.faults_of_motion(params.guard, state.seen)
-        )
-        core.faults = faults
-        core.guard = guard.state_of(params.guard, state.guard, state.seen, faults)
-        wanted = int64(state.outputs.force)
-        specific = guard.limited(params.guard, state.guard, state.seen, int64(core.guard), wanted)
-        asked = round_shift(specific * int64(params.core.mass), Q_ACCELERATION) >> _FORCE_SHIFT
-        force = saturate(FORCE_CMD.Force, asked) << _FORCE_SHIFT
-        force = distribution.distribute(params.distribution, force, core.car_force)
-        raw = force >> _FORCE_SHIFT
-        inputs.limited = 1 if specific != wanted or raw != asked else 0
-        core.force = force
-
-        tick = int64(core.tick)
-        car_words(core, tx, int64(params.distribution.cars))
-        phase = tick % STATUS_PERIOD
-        if phase == 0:
-            e2e.send(core, tx, ATO_STATUS, status_word(params, core))
-            e2e.send(core, tx, ATO_TRACKING, tracking_word(inputs))
-        if phase < int64(params.core.estimates):
-            e2e.send(
-                core,
-                tx,
-                ATO_ESTIMATE,
-                estimate_word(
-                    phase,
-                    int64(params.core.exponent[phase]),
-                    int64(state.outputs.estimate[phase]),
-                ),
-            )
-        if has_neighbours and phase == 0:
-            e2e.send(core, tx, ATO_RADIO, radio_word(state))
-        e2e.send(
-            core,
-            tx,
-            FORCE_CMD,
-            put(FORCE_CMD.Force, raw)
-            + put(FORCE_CMD.Mode, mode_of(int64(core.guard), force))
-            + put(FORCE_CMD.Tick, tick & TICK_MASK),
-        )
-        reference.advance(params.reference, state.cursor, profile)
-        reference.advance(params.reference, state.ahead, profile)
-        core.tick = tick + 1
-
-    @step
     def tick(
         params: Any, profile: Any, state: Any, cells: Any, rx: Any, tx: Any, period: Any
     ) -> None:
-        core = state.core
-        if receive(params.slow, state, rx, RUN_CTRL) != 0:
-            word = int64(rx[RUN_CTRL.index].payload)
-            wanted = get(word, RUN_CTRL.RunState)
-            if wanted > ENDED:
-                wanted = int64(IDLE)
-            if wanted == RUNNING:
-                # A run starts only from armed: a controller that restarts inside a run stays
-                # silent.
-                if int64(core.run_state) == ARMED:
-                    core.run_state = RUNNING
-            else:
-                core.run_state = wanted
-                core.iteration = get(word, RUN_CTRL.Iteration)
-                if wanted == ARMED:
-                    rate = get(word, RUN_CTRL.TimetableRate) << _RATE_SHIFT
-                    begin(params, profile, state, cells, rate)
-                e2e.send(core, tx, ATO_STATUS, status_word(params, core))
-        if int64(core.run_state) == RUNNING and period == 1:
-            read_inputs(params, state, rx)
-            run_tick(params, profile, state, cells, rx, tx)
+        if before_law(params, profile, state, cells, rx, tx, period) != 0:
+            law_step(params.law, state.law, state.cell, state.inputs, state.outputs)
+            after_law(params, profile, state, cells, tx)
 
     return tick

@@ -11,11 +11,15 @@ within SECTIONS_MAX ticks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.q import (
     INT32_MAX,
     clamp,
@@ -58,7 +62,7 @@ def calibrate(sections: Sequence[tuple[float, float, float]]) -> np.ndarray:
 
 
 @step
-def read(params: Any, section: Any, position: Any) -> Any:
+def read(params: Record, section: Int, position: Int) -> Int:
     """Number of the section at `position` (m, Q15), 0 before the first, from that of a tick ago."""
     if section < int64(params.sections) and position >= int64(params.start[section]):
         return section + 1
@@ -68,7 +72,7 @@ def read(params: Any, section: Any, position: Any) -> Any:
 
 
 @step
-def acceleration(params: Any, section: Any, position: Any) -> Any:
+def acceleration(params: Record, section: Int, position: Int) -> Int:
     """What the map says at `position` in section number `section`, m/s^2, Q27."""
     if section == 0:
         return int64(0)

@@ -34,7 +34,13 @@ from typing import Any
 
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.codec import ATP_LIMIT, values
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.interface import (
     FAULT_ATP,
     FAULT_BARRIER,
@@ -84,9 +90,11 @@ FAULTS_THAT_BRAKE = sum(
 )
 
 # Supervision and Quality, as in ATP_LIMIT and TRAIN_SPEED.
-ATP_WARNING, ATP_SERVICE_BRAKE, ATP_EMERGENCY_BRAKE = 1, 2, 3
-SENSOR_INVALID = 2
-NO_TARGET = 65535  # TargetDistance of ATP_LIMIT
+ATP_WARNING, ATP_SERVICE_BRAKE, ATP_EMERGENCY_BRAKE = values(
+    "ATP_LIMIT", "Supervision", "warning service_brake emergency_brake"
+)
+(SENSOR_INVALID,) = values("TRAIN_SPEED", "Quality", "invalid")
+NO_TARGET = (1 << ATP_LIMIT.TargetDistance.length) - 1  # the largest distance that it can say
 
 PARAMS = np.dtype(
     [
@@ -153,7 +161,7 @@ def reaction_ticks(params: Any) -> dict[int, int]:
 
 
 @step
-def begin(seen: Any, state: Any) -> None:
+def begin(seen: Record, state: Record) -> None:
     """Nothing seen, nothing latched: a run starts."""
     seen.speed = 0
     seen.acceleration = 0
@@ -171,7 +179,7 @@ def begin(seen: Any, state: Any) -> None:
 
 
 @step
-def faults_of_inputs(params: Any, seen: Any) -> Any:
+def faults_of_inputs(params: Record, seen: Record) -> Int:
     """Fault bits of messages that are too old and of the sensor's own report."""
     faults = int64(0)
     if int64(seen.speed_age) > int64(params.age_max):
@@ -188,7 +196,7 @@ def faults_of_inputs(params: Any, seen: Any) -> Any:
 
 
 @step
-def faults_of_motion(params: Any, seen: Any) -> Any:
+def faults_of_motion(params: Record, seen: Record) -> Int:
     """Fault bits of overspeed, from the first LSB, of a target that needs a brake, and of what ATP
     demands."""
     faults = int64(0)
@@ -205,14 +213,14 @@ def faults_of_motion(params: Any, seen: Any) -> Any:
 
 
 @step
-def is_above(seen: Any, margin: Any) -> Any:
+def is_above(seen: Record, margin: Int) -> Int:
     """1 if the speed is above the permitted one by more than `margin`, Q24."""
     above = int64(seen.speed) - int64(seen.permitted_speed)
     return int64(1) if above > margin else int64(0)
 
 
 @step
-def speed_ahead(params: Any, seen: Any, ticks: Any) -> Any:
+def speed_ahead(params: Record, seen: Record, ticks: Int) -> Int:
     """Speed in so many ticks if the present acceleration lasts, Q24; a deceleration does not
     count."""
     gain = (max(int64(seen.acceleration), int64(0)) * int64(params.period)) >> 30  # Q27 a tick
@@ -220,7 +228,7 @@ def speed_ahead(params: Any, seen: Any, ticks: Any) -> Any:
 
 
 @step
-def is_too_fast_for_target(params: Any, seen: Any, ticks: Any) -> Any:
+def is_too_fast_for_target(params: Record, seen: Record, ticks: Int) -> Int:
     """1 if the speed in so many ticks needs more than the deceleration counted on to be the
     target's where the target is; an old ATP_LIMIT looks further ahead."""
     if int64(seen.target_distance) == NO_TARGET:
@@ -239,13 +247,13 @@ def is_too_fast_for_target(params: Any, seen: Any, ticks: Any) -> Any:
 
 
 @step
-def stands(params: Any, seen: Any) -> Any:
+def stands(params: Record, seen: Record) -> Int:
     """1 if the train stands."""
     return int64(1) if abs(int64(seen.speed)) <= int64(params.standstill) else int64(0)
 
 
 @step
-def must_cut(params: Any, seen: Any) -> Any:
+def must_cut(params: Record, seen: Record) -> Int:
     """1 if there may be no traction."""
     if int64(seen.supervision) >= ATP_WARNING:
         return int64(1)
@@ -255,7 +263,7 @@ def must_cut(params: Any, seen: Any) -> Any:
 
 
 @step
-def must_brake(params: Any, seen: Any) -> Any:
+def must_brake(params: Record, seen: Record) -> Int:
     """1 if the service brake has to come on."""
     return is_above(seen, int64(params.brake_margin)) | is_too_fast_for_target(
         params, seen, int64(params.brake_ahead)
@@ -266,7 +274,7 @@ def must_brake(params: Any, seen: Any) -> Any:
 
 
 @step
-def latch(params: Any, state: Any, seen: Any) -> None:
+def latch(params: Record, state: Record, seen: Record) -> None:
     """Emergency request and service brake by the speed of now: when they begin and end."""
     demanded = int64(seen.supervision) >= ATP_EMERGENCY_BRAKE
     if demanded or is_above(seen, int64(params.emergency_margin)) != 0:
@@ -280,7 +288,7 @@ def latch(params: Any, state: Any, seen: Any) -> None:
 
 
 @step
-def state_of(params: Any, state: Any, seen: Any, faults: Any) -> Any:
+def state_of(params: Record, state: Record, seen: Record, faults: Int) -> Int:
     """What the guard does, about the latched faults and about the speed of now; once a tick."""
     latch(params, state, seen)
     if int64(state.emergency) != 0:
@@ -296,7 +304,7 @@ def state_of(params: Any, state: Any, seen: Any, faults: Any) -> Any:
 
 
 @step
-def comfortable(params: Any, state: Any, seen: Any, force: Any) -> Any:
+def comfortable(params: Record, state: Record, seen: Record, force: Int) -> Int:
     """The law's force within range and jerk, Q27; above the largest acceleration it does not
     grow."""
     last = int64(state.force)
@@ -307,7 +315,7 @@ def comfortable(params: Any, state: Any, seen: Any, force: Any) -> Any:
 
 
 @step
-def limited(params: Any, state: Any, seen: Any, reaction: Any, force: Any) -> Any:
+def limited(params: Record, state: Record, seen: Record, reaction: Int, force: Int) -> Int:
     """The force that the guard lets pass, Q27, for what `state_of` said and the law wants; once a
     tick."""
     if reaction == GUARD_EMERGENCY:

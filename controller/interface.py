@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ato_hil.can_dbc.codec import values
+
 ESTIMATES_MAX = 10
 SIDES = 2  # neighbours of a train: the one ahead, the one behind
 AHEAD, BEHIND = 0, 1
@@ -47,13 +49,17 @@ OUTPUTS = np.dtype(
 )
 
 # Run states, as in RUN_CTRL and ATO_STATUS.
-IDLE, ARMED, RUNNING, ENDED = 0, 1, 2, 3
+IDLE, ARMED, RUNNING, ENDED = values("RUN_CTRL", "RunState", "idle armed running ended")
 
 # Force modes, as in FORCE_CMD.
-COAST, TRACTION, BRAKE, HOLD, EMERGENCY_REQUEST = 0, 1, 2, 3, 4
+COAST, TRACTION, BRAKE, HOLD, EMERGENCY_REQUEST = values(
+    "FORCE_CMD", "Mode", "coast traction brake hold emergency_request"
+)
 
 # Guard states, as in ATO_STATUS.
-GUARD_NORMAL, GUARD_HOLD, GUARD_COAST, GUARD_SERVICE_BRAKE, GUARD_EMERGENCY = 0, 1, 2, 3, 4
+GUARD_NORMAL, GUARD_HOLD, GUARD_COAST, GUARD_SERVICE_BRAKE, GUARD_EMERGENCY = values(
+    "ATO_STATUS", "Guard", "normal hold coast service_brake emergency_request"
+)
 
 # Fault bits of ATO_STATUS.
 FAULT_SPEED_LOST = 1 << 0  # TRAIN_SPEED missing, corrupt or out of sequence

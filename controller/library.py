@@ -52,7 +52,7 @@ def source_digest(law: str) -> str:
     """Digest of all sources that the firmware around a law is made of."""
     parts = [step.source_digest("controller")]
     if is_file(law):
-        parts.append(inspect.getsource(load_law(law)))
+        parts.append(inspect.getsource(load_law(law).module))
     return hashlib.blake2b("\n".join(parts).encode(), digest_size=12).hexdigest()
 
 

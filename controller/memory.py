@@ -22,11 +22,15 @@ Contract: `gather` and `scatter` are steps of bounded time that run inside the t
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Array,
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.q import (
     INT32_MAX,
     clamp,
@@ -90,7 +94,7 @@ MEMORY_STATE = np.dtype(
 
 
 @step
-def rewind(params: Any, state: Any, memory: Any, cell: Any) -> None:
+def rewind(params: Record, state: Record, memory: Array, cell: Record) -> None:
     """The state at the start of a run; the generation stays. Words that are not stored are at their
     initial value throughout."""
     for w in range(WORDS_MAX):
@@ -111,7 +115,7 @@ def rewind(params: Any, state: Any, memory: Any, cell: Any) -> None:
 
 
 @step
-def slide(params: Any, state: Any, memory: Any, here: Any) -> None:
+def slide(params: Record, state: Record, memory: Array, here: Int) -> None:
     """Moves the window of the moving average from cell `here` - 1 to `here`; beyond both ends the
     first and the last cell go on."""
     generation = int64(state.generation)
@@ -124,7 +128,7 @@ def slide(params: Any, state: Any, memory: Any, here: Any) -> None:
 
 
 @step
-def recall(params: Any, state: Any, memory: Any, cell: Any) -> None:
+def recall(params: Record, state: Record, memory: Array, cell: Record) -> None:
     """`cell.ahead` and `cell.smooth` for the current tick."""
     here = int64(state.read_cell)
     later = min(here + int64(params.ahead), int64(params.cells) - 1)
@@ -136,7 +140,7 @@ def recall(params: Any, state: Any, memory: Any, cell: Any) -> None:
 
 
 @step
-def gather_along(params: Any, state: Any, memory: Any, cell: Any, position: Any) -> None:
+def gather_along(params: Record, state: Record, memory: Array, cell: Record, position: Int) -> None:
     """`cell.before` at `position`; before the first and beyond the last cell, that cell's."""
     pitch = int64(params.pitch)
     last = int64(params.cells) - 1
@@ -155,7 +159,7 @@ def gather_along(params: Any, state: Any, memory: Any, cell: Any, position: Any)
 
 
 @step
-def scatter_along(params: Any, state: Any, memory: Any, cell: Any) -> None:
+def scatter_along(params: Record, state: Record, memory: Array, cell: Record) -> None:
     """Shares `cell.learn` between the two cells that `gather_along` has read."""
     here = int64(state.read_cell)
     ahead = min(here + 1, int64(params.cells) - 1)
@@ -173,7 +177,7 @@ def scatter_along(params: Any, state: Any, memory: Any, cell: Any) -> None:
 
 
 @step
-def gather(params: Any, state: Any, memory: Any, cell: Any, position: Any) -> None:
+def gather(params: Record, state: Record, memory: Array, cell: Record, position: Int) -> None:
     """`cell.before` for the current tick, with the train at `position` (m, Q15), and the read
     position one tick on."""
     words = int64(params.words)
@@ -212,7 +216,7 @@ def gather(params: Any, state: Any, memory: Any, cell: Any, position: Any) -> No
 
 
 @step
-def scatter(params: Any, state: Any, memory: Any, cell: Any) -> None:
+def scatter(params: Record, state: Record, memory: Array, cell: Record) -> None:
     """Takes `cell.learn` of the current tick; closes the cell with its last tick."""
     words = int64(params.words)
     if int64(params.pitch) > 0:
@@ -230,7 +234,7 @@ def scatter(params: Any, state: Any, memory: Any, cell: Any) -> None:
 
 
 @step
-def close_cell(params: Any, state: Any, memory: Any) -> None:
+def close_cell(params: Record, state: Record, memory: Array) -> None:
     """Adds the mean increment of the open cell to its value in the generation that is written;
     opens the next."""
     ticks = int64(state.write_phase)

@@ -18,8 +18,6 @@ without neighbours.
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
 import numpy as np
 
@@ -29,7 +27,12 @@ from ato_hil.can_dbc.codec import (
     binary_exponent,
     get,
 )
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.interface import SIDES
 from ato_hil.controller.q import (
     Q_POSITION,
@@ -108,13 +111,13 @@ def calibrate(
 
 
 @step
-def any_exist(params: Any) -> Any:
+def any_exist(params: Record) -> Int:
     """1 if the train has a neighbour."""
     return int64(params.exists[0]) | int64(params.exists[1])
 
 
 @step
-def begin(state: Any) -> None:
+def begin(state: Record) -> None:
     """Nothing heard yet: a run starts."""
     for k in range(SIDES):
         side = state.side[k]
@@ -126,7 +129,7 @@ def begin(state: Any) -> None:
 
 
 @step
-def remember(state: Any, inputs: Any) -> None:
+def remember(state: Record, inputs: Record) -> None:
     """Keeps the timetable of this tick, and lets the data age by a tick."""
     slot = int64(inputs.tick) & (HISTORY - 1)
     state.position[slot] = inputs.reference_position
@@ -137,14 +140,14 @@ def remember(state: Any, inputs: Any) -> None:
 
 @step
 def accept(
-    params: Any,
-    state: Any,
-    k: Any,
-    tick: Any,
-    position: Any,
-    position_word: Any,
-    motion: Any,
-    motion_word: Any,
+    params: Record,
+    state: Record,
+    k: Int,
+    tick: Int,
+    position: Record,
+    position_word: Int,
+    motion: Record,
+    motion_word: Int,
 ) -> None:
     """What the two frames of side k say: messages `position` and `motion` with their words. Data of
     a tick whose timetable is no longer kept are dropped."""
@@ -165,7 +168,7 @@ def accept(
 
 
 @step
-def project(params: Any, state: Any, inputs: Any) -> Any:
+def project(params: Record, state: Record, inputs: Record) -> Int:
     """The neighbours as they are now, into `inputs`; 1 if one of them is lost."""
     lost = int64(0)
     for k in range(SIDES):

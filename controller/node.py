@@ -23,7 +23,7 @@ from ato_hil.controller.interface import (
     FAULTS_THAT_BLOCK_LEARNING,
     RUNNING,
 )
-from ato_hil.controller.registry import law_step, load_law
+from ato_hil.controller.registry import load_law
 
 
 @dataclass
@@ -79,18 +79,15 @@ def build(
     Raises store.MemoryFileError if the memory file is foreign or damaged, LibraryError if the
     library is.
     """
-    module = load_law(calibration.law)
-    state = np.zeros(1, state_dtype(module.STATE))
+    law = load_law(calibration.law)
+    state = np.zeros(1, state_dtype(law.STATE))
     state["links"]["counter"] = -1  # no frame received yet
     cells = memory.initial_memory(
         calibration.params[0]["memory"], np.dtype(calibration.memory_dtype).type
     )
     if memory_file is not None and memory_file.exists():
         cells[0] = store.load(memory_file, calibration).cells
-    if firmware is None:
-        tick = build_tick(law_step(module))
-    else:
-        tick = library.load(firmware, calibration)
+    tick = build_tick(law.step) if firmware is None else library.load(firmware, calibration)
     return Controller(
         calibration=calibration,
         tick=tick,

@@ -24,7 +24,12 @@ from typing import Any
 
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.interface import (
     FAULT_POSITION_IMPLAUSIBLE,
     FAULT_PROGRESS,
@@ -79,7 +84,7 @@ def reaction_ticks(params: Any, wrong_m_s: float) -> int | None:
 
 
 @step
-def begin(state: Any) -> None:
+def begin(state: Record) -> None:
     """No sample yet: a run starts."""
     state.travelled = 0
     state.start = 0
@@ -93,8 +98,13 @@ def begin(state: Any) -> None:
 
 @step
 def faults_of_samples(
-    params: Any, state: Any, speed: Any, speed_is_new: Any, position: Any, position_is_new: Any
-) -> Any:
+    params: Record,
+    state: Record,
+    speed: Int,
+    speed_is_new: Int,
+    position: Int,
+    position_is_new: Int,
+) -> Int:
     """Fault bits of this tick, from speed (Q24) and position (Q15) of now; once a tick."""
     faults = faults_of_progress(params, state, speed, position, position_is_new)
     if speed_is_new != 0:
@@ -107,7 +117,7 @@ def faults_of_samples(
 
 
 @step
-def older(ticks: Any, is_new: Any) -> Any:
+def older(ticks: Int, is_new: Int) -> Int:
     """Ticks from the last sample to the tick that comes."""
     if is_new != 0:
         return int64(1)
@@ -117,7 +127,7 @@ def older(ticks: Any, is_new: Any) -> Any:
 
 
 @step
-def faults_of_speed(params: Any, state: Any, speed: Any) -> Any:
+def faults_of_speed(params: Record, state: Record, speed: Int) -> Int:
     """Of a new sample: range, and the change since the last one."""
     faults = int64(0)
     if speed < int64(params.speed_min) or speed > int64(params.speed_max):
@@ -131,7 +141,7 @@ def faults_of_speed(params: Any, state: Any, speed: Any) -> Any:
 
 
 @step
-def faults_of_position(params: Any, state: Any, position: Any) -> Any:
+def faults_of_position(params: Record, state: Record, position: Int) -> Int:
     """Of a new sample: range, and the change since the last one."""
     faults = int64(0)
     if position < int64(params.position_min) or position > int64(params.position_max):
@@ -146,8 +156,8 @@ def faults_of_position(params: Any, state: Any, position: Any) -> Any:
 
 @step
 def faults_of_progress(
-    params: Any, state: Any, speed: Any, position: Any, position_is_new: Any
-) -> Any:
+    params: Record, state: Record, speed: Int, position: Int, position_is_new: Int
+) -> Int:
     """Of position against speed. Nothing before the first position, which starts the first
     window."""
     faults = int64(0)

@@ -10,9 +10,7 @@ inside and says why.
 
 from __future__ import annotations
 
-from typing import Any
-
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import Int, int64, step
 
 # Quantity: LSB = 2**-Q of its unit; int32 unless said otherwise.
 Q_POSITION = 15  # m: +-65.5 km, 31 um
@@ -27,26 +25,26 @@ INT32_MIN = -(2**31)
 
 
 @step
-def clamp(value: Any, low: Any, high: Any) -> Any:
+def clamp(value: Int, low: Int, high: Int) -> Int:
     """`value` limited to [low, high]."""
     return min(max(value, low), high)
 
 
 @step
-def sat32(value: Any) -> Any:
+def sat32(value: Int) -> Int:
     """`value` limited to the int32 range."""
     return min(max(value, int64(INT32_MIN)), int64(INT32_MAX))
 
 
 @step
-def round_shift(value: Any, bits: Any) -> Any:
+def round_shift(value: Int, bits: Int) -> Int:
     """value / 2**bits, rounded half up; bits 1..62, constant at the call; |value| < 2**63 -
     2**(bits-1)."""
     return (value + (int64(1) << (bits - 1))) >> bits
 
 
 @step
-def divide_round(numerator: Any, denominator: Any) -> Any:
+def divide_round(numerator: Int, denominator: Int) -> Int:
     """numerator / denominator, rounded half up; 0 if the denominator is 0.
 
     |numerator| <= 2**61, 0 <= denominator < 2**62.
@@ -63,7 +61,7 @@ _SIN_7 = round(-0.00437093 * 2**28)
 
 
 @step
-def sin_half_pi(s: Any) -> Any:
+def sin_half_pi(s: Int) -> Int:
     """sin(pi/2 * s), Q30, for s in Q30 in [0, 1]; error below 1.2e-6 of it and half an LSB."""
     square = (s * s) >> 30
     series = _SIN_5 + ((_SIN_7 * square) >> 30)
@@ -82,7 +80,7 @@ _EXP2_6 = round(0.00010993602092287385 * 2**30)
 
 
 @step
-def exp2_minus(x: Any) -> Any:
+def exp2_minus(x: Int) -> Int:
     """2^-x, Q30, for x in Q24, 0 <= x < 2^62; error below 1e-8, 0 from x = 32 on."""
     f = (x & 0xFFFFFF) << 6  # fraction of x, Q30
     series = _EXP2_5 + ((_EXP2_6 * f) >> 30)

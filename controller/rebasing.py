@@ -29,12 +29,17 @@ Contract: `follow` is a step of bounded time.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Array,
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller import separation
 from ato_hil.controller.interface import AHEAD, BEHIND, SIDES
 from ato_hil.controller.q import clamp, round_shift, sat32
@@ -127,7 +132,7 @@ def calibrate(settings: RebasingSettings, *, period_s: float, spacing_m: float) 
 
 
 @step
-def begin(state: Any) -> None:
+def begin(state: Record) -> None:
     """On the timetable: a run starts."""
     state.offset = 0
     state.offset_speed = 0
@@ -136,25 +141,25 @@ def begin(state: Any) -> None:
 
 
 @step
-def emergency_to_rear(state: Any, sides: Any) -> Any:
+def emergency_to_rear(state: Record, sides: Array) -> Int:
     """1 if this train or one ahead of it brakes in an emergency."""
     return int64(state.braking) | int64(sides[AHEAD].emergency)
 
 
 @step
-def emergency_to_front(state: Any, sides: Any) -> Any:
+def emergency_to_front(state: Record, sides: Array) -> Int:
     """1 if this train or one behind it brakes in an emergency."""
     return int64(state.braking) | int64(sides[BEHIND].emergency)
 
 
 @step
-def emergency(state: Any, sides: Any) -> Any:
+def emergency(state: Record, sides: Array) -> Int:
     """1 if a train of the line brakes in an emergency."""
     return emergency_to_rear(state, sides) | emergency_to_front(state, sides)
 
 
 @step
-def off_spacing(params: Any, inputs: Any, side: Any) -> Any:
+def off_spacing(params: Record, inputs: Record, side: Int) -> Int:
     """How far the distance to a neighbour is off S0, m, Q15; 0 if its data do not count."""
     if int64(inputs.neighbour[side]) == 0:
         return int64(0)
@@ -162,7 +167,7 @@ def off_spacing(params: Any, inputs: Any, side: Any) -> Any:
 
 
 @step
-def must_leave(params: Any, state: Any, sides: Any, inputs: Any) -> Any:
+def must_leave(params: Record, state: Record, sides: Array, inputs: Record) -> Int:
     """1 if the train cannot stay on its timetable."""
     error = int64(inputs.position) - int64(inputs.reference_position)
     if abs(error) > int64(params.error_max) or emergency(state, sides) != 0:
@@ -176,7 +181,7 @@ def must_leave(params: Any, state: Any, sides: Any, inputs: Any) -> Any:
 
 
 @step
-def catch(params: Any, state: Any, inputs: Any) -> None:
+def catch(params: Record, state: Record, inputs: Record) -> None:
     """The reference moves to within error_max of a train that it has left behind."""
     reference = int64(inputs.reference_position) + (int64(state.offset) >> 25)
     error = int64(inputs.position) - reference
@@ -192,7 +197,7 @@ def catch(params: Any, state: Any, inputs: Any) -> None:
 
 
 @step
-def way_back(params: Any, state: Any, inputs: Any) -> Any:
+def way_back(params: Record, state: Record, inputs: Record) -> Int:
     """R, m/s^2, Q27."""
     for side in range(SIDES):
         if off_spacing(params, inputs, side) > int64(params.return_within):
@@ -203,7 +208,7 @@ def way_back(params: Any, state: Any, inputs: Any) -> Any:
 
 
 @step
-def wanted_acceleration(params: Any, state: Any, sides: Any, inputs: Any) -> Any:
+def wanted_acceleration(params: Record, state: Record, sides: Array, inputs: Record) -> Int:
     """a_r, m/s^2, Q27."""
     drift = int64(inputs.speed) - int64(inputs.reference_speed) - (int64(state.offset_speed) >> 8)
     total = int64(0)  # sum of v_j - v_r, Q24
@@ -227,7 +232,7 @@ def wanted_acceleration(params: Any, state: Any, sides: Any, inputs: Any) -> Any
 
 
 @step
-def bound_speed(params: Any, state: Any, inputs: Any) -> None:
+def bound_speed(params: Record, state: Record, inputs: Record) -> None:
     """v_r within [0, v_max]."""
     common = int64(inputs.reference_speed) << 8  # v_d, Q32
     most = int64(params.speed_max) << 8
@@ -236,7 +241,7 @@ def bound_speed(params: Any, state: Any, inputs: Any) -> None:
 
 
 @step
-def stand(state: Any, inputs: Any) -> None:
+def stand(state: Record, inputs: Record) -> None:
     """v_r = 0 exactly when the reference has come to rest: what the jerk of the timetable adds in a
     tick would start it again."""
     common = int64(inputs.reference_speed)
@@ -245,7 +250,7 @@ def stand(state: Any, inputs: Any) -> None:
 
 
 @step
-def advance(params: Any, state: Any, change: Any) -> None:
+def advance(params: Record, state: Record, change: Int) -> None:
     """off and offv a tick later; change = a_r - a_d, Q27."""
     period = int64(params.period)
     speed = int64(state.offset_speed)
@@ -256,7 +261,7 @@ def advance(params: Any, state: Any, change: Any) -> None:
 
 
 @step
-def follow(params: Any, state: Any, sides: Any, inputs: Any) -> None:
+def follow(params: Record, state: Record, sides: Array, inputs: Record) -> None:
     """The reference that the train follows in this tick, into `inputs`; re-based, the law does not
     cooperate by itself."""
     if int64(params.enabled) == 0:

@@ -16,11 +16,15 @@ cursor stays where it is.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Array,
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.q import round_shift, sat32
 
 SEGMENT = np.dtype([("ticks", np.int32), ("jerk", np.int32)], align=True)
@@ -58,7 +62,7 @@ ONE = 1 << Q_RATE
 
 
 @step
-def rewind(cursor: Any, profile: Any, rate: Any) -> None:
+def rewind(cursor: Record, profile: Array, rate: Int) -> None:
     """The cursor at the start of the profile, standing; `rate` of the timetable, less 1, Q24."""
     cursor.x = 0
     cursor.v = 0
@@ -71,7 +75,7 @@ def rewind(cursor: Any, profile: Any, rate: Any) -> None:
 
 
 @step
-def advance(params: Any, cursor: Any, profile: Any) -> None:
+def advance(params: Record, cursor: Record, profile: Array) -> None:
     """The cursor one control period later: none, one or two ticks of the table."""
     phase = int64(cursor.phase) + ONE + int64(cursor.rate)
     for _ in range(2):
@@ -82,7 +86,7 @@ def advance(params: Any, cursor: Any, profile: Any) -> None:
 
 
 @step
-def next_tick(params: Any, cursor: Any, profile: Any) -> None:
+def next_tick(params: Record, cursor: Record, profile: Array) -> None:
     """The cursor at the start of the next tick of the table."""
     if int64(cursor.left) > 0:
         jerk = int64(cursor.jerk)
@@ -104,14 +108,14 @@ def next_tick(params: Any, cursor: Any, profile: Any) -> None:
 
 
 @step
-def times(value: Any, factor: Any) -> Any:
+def times(value: Int, factor: Int) -> Int:
     """value * factor / 2^24, rounded half up, without a product beyond 63 bits: 0 <= factor <
     2^25, |value| < 2^61."""
     return (value >> Q_RATE) * factor + round_shift((value & (ONE - 1)) * factor, Q_RATE)
 
 
 @step
-def position(cursor: Any) -> Any:
+def position(cursor: Record) -> Int:
     """Reference position, m, Q15."""
     x = int64(cursor.x)
     if int64(cursor.phase) > 0:
@@ -122,7 +126,7 @@ def position(cursor: Any) -> Any:
 
 
 @step
-def speed(params: Any, cursor: Any) -> Any:
+def speed(params: Record, cursor: Record) -> Int:
     """Reference speed, m/s, Q24."""
     v = int64(cursor.v)
     if int64(cursor.rate) != 0:
@@ -133,7 +137,7 @@ def speed(params: Any, cursor: Any) -> Any:
 
 
 @step
-def acceleration(params: Any, cursor: Any) -> Any:
+def acceleration(params: Record, cursor: Record) -> Int:
     """Reference acceleration, m/s^2, Q27."""
     a = int64(cursor.a)
     if int64(cursor.rate) != 0:

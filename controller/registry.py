@@ -9,20 +9,48 @@ import keyword
 import pkgutil
 import sys
 import traceback
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ato_hil.can_dbc.codec import choices
-from ato_hil.can_dbc.errors import InputError
-from ato_hil.controller import laws, subset
+import numpy as np
 
+from ato_hil.can_dbc.codec import choices
+from ato_hil.can_dbc.errors import InputError, expected
+from ato_hil.controller import laws, subset
+from ato_hil.controller.quantise import Recall, Vehicle
+
+Word = tuple[str, str, int]  # name, unit, Q
 PARTS = ("PARAMS", "STATE", "WORDS", "ESTIMATES", "Gains", "calibrate")  # of a law's module
 
 
 class LawError(InputError):
     """There is no such law, or its file is none; one line that says what was expected."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law: the names of its file, with what the file may leave out filled in."""
+
+    module: ModuleType  # the file
+    step: Any  # law(params, state, cell, inputs, outputs), named as the file
+    PARAMS: np.dtype
+    STATE: np.dtype
+    WORDS: tuple[Word, ...]  # learned; empty: it does not learn
+    ESTIMATES: tuple[Word, ...]  # in the traces
+    Gains: type[Any]  # a msgspec Struct
+    calibrate: Callable[[Any, Vehicle], np.ndarray]  # PARAMS, (1,), from Gains
+    # What a file may leave out.
+    STATE_BOUNDS: Mapping[str, tuple[int, int]]  # of the int64 fields of STATE, which it keeps
+    INITIAL_RUN: bool  # runs are numbered from 0: the first is made before anything is learned
+    SCENARIO: str | None  # that the law is verified on; none: any that has gains for it
+    # Initial value, lower and upper bound of each word.
+    learned: Callable[[Any, Vehicle], tuple[list[int], list[int], list[int]]]
+    words_stored: Callable[[Any], int | None]  # first words that the memory keeps; none: all
+    recall: Callable[[Any], Recall | None]  # what it sees of the last run
+    pitch_m: Callable[[Any], float | None]  # of cells along the track; none: along the time
 
 
 def law_names() -> list[str]:
@@ -40,13 +68,38 @@ def law_label(name: str) -> str:
     return Path(name).stem.replace("_", "-") if is_file(name) else name
 
 
-def load_law(name: str) -> ModuleType:
-    """Module of a law. Raises LawError if there is none of that name, or if its file is no law."""
+def load_law(name: str) -> Law:
+    """A law by name. Raises LawError if there is none of that name, or if its file is no law."""
     if is_file(name):
-        return _load_file(Path(name))
+        return law_of(_load_file(Path(name)))
     if name not in law_names():
-        raise LawError(f"law {name!r} is unknown, expected one of {', '.join(law_names())}")
-    return importlib.import_module(f"ato_hil.controller.laws.{name.replace('-', '_')}")
+        raise LawError(f"law {name!r} is unknown, {expected(name, law_names())}")
+    return law_of(importlib.import_module(f"ato_hil.controller.laws.{name.replace('-', '_')}"))
+
+
+def law_of(module: Any) -> Law:
+    """The law that a module defines; it has all of PARTS."""
+    optional = vars(module).get
+    return Law(
+        module=module,
+        step=vars(module)[module.__name__.rsplit(".", 1)[-1]],
+        **{part: vars(module)[part] for part in PARTS},
+        STATE_BOUNDS=optional("STATE_BOUNDS", {}),
+        INITIAL_RUN=optional("INITIAL_RUN", False),
+        SCENARIO=optional("SCENARIO"),
+        learned=optional("learned", _learns_nothing),
+        words_stored=optional("words_stored", _none),
+        recall=optional("recall", _none),
+        pitch_m=optional("pitch_m", _none),
+    )
+
+
+def _none(gains: Any) -> None:
+    """Whatever the gains."""
+
+
+def _learns_nothing(gains: Any, vehicle: Vehicle) -> tuple[list[int], list[int], list[int]]:
+    return [], [], []
 
 
 def _load_file(path: Path) -> ModuleType:
@@ -75,7 +128,8 @@ def _load_file(path: Path) -> ModuleType:
     except (Exception, SystemExit) as error:  # whatever the file does when it is executed
         del sys.modules[name]
         raise LawError(place(path, error)) from None
-    for part in (*PARTS, path.stem):
+    learned = ("learned",) if getattr(module, "WORDS", ()) else ()
+    for part in (*PARTS, *learned, path.stem):
         if not hasattr(module, part):
             del sys.modules[name]
             raise LawError(f"{path}: expected {part}, see the laws in {laws.__path__[0]}")
@@ -100,11 +154,6 @@ def place(path: Path, error: BaseException) -> str:
     at = f"{path}:{lines[-1]}" if lines and lines[-1] else str(path)
     text = " ".join(str(error.msg if isinstance(error, SyntaxError) else error).split())
     return f"{at}: {type(error).__name__}: {text}"
-
-
-def law_step(module: ModuleType) -> Any:
-    """The step of a law's module: the function named as the file."""
-    return getattr(module, module.__name__.rsplit(".", 1)[-1])
 
 
 def law_number(name: str) -> int:

@@ -18,11 +18,14 @@ r^2/(l2^2 - D^2)^2) with G = 2 d/r^2.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.interface import SIDES
 from ato_hil.controller.q import clamp, round_shift, sat32
 from ato_hil.controller.quantise import CalibrationError, fixed
@@ -58,7 +61,7 @@ def calibrate(*, l1_m: float, l2_m: float, d: float, most_m_s2: float) -> np.nda
 
 
 @step
-def push(params: Any, distance: Any) -> Any:
+def push(params: Record, distance: Int) -> Int:
     """The share of one neighbour at D = `distance` (m, Q15), m/s^2, Q27."""
     square = (distance * distance) >> 22  # m^2, Q8, below 2^41
     over_inner = max(square - int64(params.inner), int64(params.least))
@@ -72,7 +75,7 @@ def push(params: Any, distance: Any) -> Any:
 
 
 @step
-def push_of_neighbours(params: Any, inputs: Any) -> Any:
+def push_of_neighbours(params: Record, inputs: Record) -> Int:
     """u2 over the neighbours whose data count, m/s^2, Q27."""
     total = int64(0)
     for side in range(SIDES):

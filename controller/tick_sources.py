@@ -31,7 +31,7 @@ SHARED_MODULES = (
 def modules_of(laws: list[str]) -> list[ModuleType]:
     """The shared modules, the modules of these laws, and those of the laws that they build on."""
     found = [importlib.import_module(name) for name in SHARED_MODULES]
-    found += [registry.load_law(name) for name in laws]
+    found += [registry.load_law(name).module for name in laws]
     for module in found:  # grows as it goes
         for value in vars(module).values():
             owner = str(getattr(value, "__module__", ""))
@@ -49,7 +49,7 @@ def unreached(laws: list[str]) -> list[str]:
     graph = calls(steps)
     ahead = [("ato_hil.controller.firmware", "tick")]
     for law in laws:
-        name = registry.load_law(law).__name__
+        name = registry.load_law(law).module.__name__
         ahead.append((name, name.rsplit(".", 1)[-1]))
     reached: set[tuple[str, str]] = set()
     while ahead:

@@ -46,40 +46,34 @@ speed until the brake is full: traction can take it past the end of authority, i
 Release: warning and service brake at or below the permitted speed, the emergency brake at
 standstill; a brake stays where nothing is permitted.
 
-All curves are tables that are made once. Between the knots of EBD, v^2 falls linearly, so every
-curve is V(d) = sqrt(square - slope (d - from)) - offset. With x the place on EBD of V + D_V:
-
-    x = d + V T + D_d,   (V + D_V)^2 = v_i^2 - 2 a (x - x_i)   =>
-    from = x_i - (v_i - D_V) T - D_d,   square = (v_i + a T)^2,   slope = 2 a,   offset = a T + D_V
+All curves are tables that are made once, `atp_tables`.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
 
+from ato_hil.can_dbc.codec import values
 from ato_hil.can_dbc.step import int64, step
-from ato_hil.plant_sim.brakes import Brake, Step, ticks_of
+from ato_hil.plant_sim.brakes import Brake, Step
 from ato_hil.plant_sim.track import section_at
-from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 NONE, MARGIN, ETCS = 0, 1, 2
 SUPERVISIONS = {"none": NONE, "margin": MARGIN, "etcs": ETCS}
 # What it demands, as in ATP_LIMIT.
-NORMAL, WARNING, SERVICE_BRAKE, EMERGENCY_BRAKE = 0, 1, 2, 3
+NORMAL, WARNING, SERVICE_BRAKE, EMERGENCY_BRAKE = values(
+    "ATP_LIMIT", "Supervision", "normal warning service_brake emergency_brake"
+)
 # The curves.
 EBD, EBI, SBI, WARN, PERMITTED = 0, 1, 2, 3, 4
 CURVES = 5
 
 KM_H = 1 / 3.6
 STANDSTILL_M_S = 0.01
-SLOPE_PIECE_M = 20.0  # a gradient that changes counts as constant over so much, its worst
-SPARE_M_S = 1.0  # how far the curves go on above the fastest that ATP lets pass
-LEAST_DECELERATION_M_S2 = 0.05  # on the steepest downhill
 
 Place = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 Length = Annotated[float, msgspec.Meta(ge=0, le=1e4)]
@@ -362,338 +356,3 @@ def decide(state: Any, speed_m_s: Any) -> None:
 def cuts_traction(params: Any, state: Any) -> Any:
     """1 if a warning is to cut traction."""
     return int64(1) if params.warning_cuts_traction != 0 and state.warning != 0 else int64(0)
-
-
-# The tables, made once.
-
-
-class Way(NamedTuple):
-    """A quantity by position: `values[i]` from `from_m[i]` to the next one; the first from -inf."""
-
-    from_m: list[float]
-    values: list[float]
-
-
-class Times(NamedTuple):
-    """Delays and allowances of the braking model, seconds and m/s."""
-
-    traction: float
-    berem: float
-    bs1: float
-    bs2: float
-    delta_0: float
-    delta_1: float
-    delta_2: float
-
-    @property
-    def delta_m_s(self) -> float:
-        """V_bec - V."""
-        return self.delta_0 + self.delta_1 + self.delta_2
-
-    @property
-    def d_bec_m(self) -> float:
-        """D_bec at V = 0; it grows by `traction + berem` for each m/s."""
-        return (self.delta_0 + self.delta_1 / 2) * self.traction + (
-            self.delta_0 + self.delta_1 + self.delta_2 / 2
-        ) * self.berem
-
-
-class Point(NamedTuple):
-    """A knot of a deceleration curve, and the deceleration behind it."""
-
-    position_m: float
-    speed_m_s: float
-    deceleration_m_s2: float
-
-
-def times_of(atp: Atp, period_s: float, a_1_m_s2: float, a_2_m_s2: float) -> Times:
-    """The braking model's times; a crossing is seen one control period late at most."""
-
-    def late(duration_s: float) -> float:
-        return (ticks_of(duration_s, period_s) + 1) * period_s
-
-    built_up_s = atp.service_brake.build_up_s
-    bs1 = late(built_up_s if atp.t_bs1_s is None else atp.t_bs1_s)
-    bs2 = late(built_up_s if atp.t_bs2_s is None else atp.t_bs2_s)
-    traction = late(atp.traction_cut_off_s)
-    if atp.warning_cuts_traction:
-        traction = max(traction - (atp.t_warning_s + bs2), 0.0)
-    berem = max(late(atp.emergency_brake.build_up_s) - traction, 0.0)
-    a_1 = a_1_m_s2 if atp.a_1_m_s2 is None else atp.a_1_m_s2
-    a_2 = a_2_m_s2 if atp.a_2_m_s2 is None else atp.a_2_m_s2
-    return Times(
-        traction, berem, bs1, bs2, atp.speed_under_reading_m_s, a_1 * traction, a_2 * berem
-    )
-
-
-def static_speeds(atp: Atp) -> Way:
-    """The static speed by position of the front: a rise counts once the rear has passed it."""
-    if not atp.speeds:
-        return Way([-math.inf], [math.inf])
-    ends = [row.until_m for row in atp.speeds[:-1]]
-    return least_behind(
-        Way([-math.inf, *ends], [row.speed_m_s for row in atp.speeds]), atp.train_length_m
-    )
-
-
-def gradients(sections: np.ndarray, train_length_m: float) -> Way:
-    """Deceleration by the track, m/s^2, at its most downhill under a train; `sections` [n] of
-    track.SECTION."""
-    from_m: list[float] = []
-    values: list[float] = []
-    ends = [*sections["from_m"][1:], math.inf]
-    for section, end in zip(sections, ends, strict=True):
-        start, slope = float(section["from_m"]), float(section["slope_n_per_kn_m"])
-        pieces = math.ceil((end - start) / SLOPE_PIECE_M) if slope != 0.0 else 1
-        for piece in range(pieces):
-            at = start + piece * SLOPE_PIECE_M if piece else start
-            into = piece * SLOPE_PIECE_M
-            both = [into, min(into + SLOPE_PIECE_M, end - start)] if slope != 0.0 else [0.0]
-            from_m.append(at)
-            values.append(
-                GRAVITY_M_S2
-                * N_PER_KN
-                * min(float(section["resistance_n_per_kn"]) + slope * each for each in both)
-            )
-    return least_behind(Way(from_m, values), train_length_m)
-
-
-def least_behind(way: Way, length_m: float) -> Way:
-    """The least value over `length_m` behind each position."""
-    ends = [*way.from_m[1:], math.inf]
-    places = sorted({*way.from_m, *(start + length_m for start in way.from_m[1:])})
-    result = Way([], [])
-    for start, end in zip(places, [*places[1:], math.inf], strict=True):
-        rear = start - length_m  # up to `end`, the rear stays in one section
-        value = min(
-            value
-            for value, first, last in zip(way.values, way.from_m, ends, strict=True)
-            if first < end and last > rear
-        )
-        if not result.values or value != result.values[-1]:
-            result.from_m.append(start)
-            result.values.append(value)
-    return result
-
-
-def deceleration_curve(
-    brake: Brake,
-    share: float,
-    gradient: Way,
-    foot_m: float,
-    foot_m_s: float,
-    top_m_s: float,
-    end_m_s: float,
-) -> list[Point]:
-    """EBD or SBD through a foot, from `top_m_s` down to `end_m_s`, by rising position. The
-    deceleration is `share` of the brake's and the gradient's."""
-    points = []
-    x, v = foot_m, foot_m_s
-    while v < top_m_s:
-        a = share * _deceleration_above(brake, v) + _value_before(gradient, x)
-        start = max((place for place in gradient.from_m if place < x), default=-math.inf)
-        faster = min((row.above_m_s for row in brake.steps if row.above_m_s > v), default=top_m_s)
-        faster = min(faster, top_m_s)
-        length = (faster * faster - v * v) / (2 * a)
-        if x - length > start:
-            x, v = x - length, faster
-        else:
-            x, v = start, math.sqrt(v * v + 2 * a * (x - start))
-        points.append(Point(x, v, a))
-    points.reverse()
-    x, v = foot_m, foot_m_s
-    while v > end_m_s:
-        a = share * _deceleration_below(brake, v) + _value_after(gradient, x)
-        end = min((place for place in gradient.from_m if place > x), default=math.inf)
-        slower = max((row.above_m_s for row in brake.steps if row.above_m_s < v), default=0.0)
-        slower = max(slower, end_m_s)
-        length = (v * v - slower * slower) / (2 * a)
-        points.append(Point(x, v, a))
-        if x + length < end:
-            x, v = x + length, slower
-        else:
-            x, v = end, math.sqrt(v * v - 2 * a * (end - x))
-    points.append(Point(x, v, 0.0))
-    return points
-
-
-def _deceleration_above(brake: Brake, speed_m_s: float) -> float:
-    rows = [row for row in brake.steps if row.above_m_s <= speed_m_s]
-    return rows[-1].deceleration_m_s2
-
-
-def _deceleration_below(brake: Brake, speed_m_s: float) -> float:
-    rows = [row for row in brake.steps if row.above_m_s < speed_m_s]
-    return rows[-1].deceleration_m_s2
-
-
-def _value_before(way: Way, position_m: float) -> float:
-    rows = [v for start, v in zip(way.from_m, way.values, strict=True) if start < position_m]
-    return rows[-1]
-
-
-def _value_after(way: Way, position_m: float) -> float:
-    rows = [v for start, v in zip(way.from_m, way.values, strict=True) if start <= position_m]
-    return rows[-1]
-
-
-def position_of(points: list[Point], speed_m_s: float) -> float:
-    """Where a deceleration curve has a speed that it passes through."""
-    for here, after in itertools.pairwise(points):
-        if speed_m_s >= after.speed_m_s:
-            square = here.speed_m_s * here.speed_m_s - speed_m_s * speed_m_s
-            return here.position_m + square / (2 * here.deceleration_m_s2)
-    return points[-1].position_m
-
-
-def knots_of(
-    points: list[Point], time_s: float, delta_m_s: float, distance_m: float
-) -> list[tuple[float, float, float, float]]:
-    """KNOT rows of the curve that lies V `time_s` + `distance_m` before a deceleration curve, at
-    speeds lower by `delta_m_s`; then 0."""
-    rows = []
-    for x, v, a in points:
-        start = x - (v - delta_m_s) * time_s - distance_m
-        offset = a * time_s + delta_m_s
-        root = v + a * time_s
-        rows.append((start, root * root, 2 * a, offset))
-    rows[-1] = (rows[-1][0], 0.0, 0.0, 0.0)
-    return rows
-
-
-class _Tables:
-    """Targets and knots as they are made."""
-
-    def __init__(self) -> None:
-        self.targets: list[tuple[Any, ...]] = []
-        self.knots: list[tuple[float, float, float, float]] = []
-
-    def add(
-        self,
-        end_m: float,
-        speed_m_s: float,
-        reach_m: float,
-        floors: dict[int, float],
-        curves: dict[int, list[tuple[float, float, float, float]]],
-    ) -> None:
-        first, last = [0] * CURVES, [0] * CURVES
-        for kind, rows in curves.items():
-            first[kind] = len(self.knots)
-            self.knots += rows
-            last[kind] = len(self.knots)
-        floor = [floors.get(kind, 0.0) for kind in range(CURVES)]
-        begin_m = curves[PERMITTED][0][0]
-        self.targets.append((begin_m, end_m, speed_m_s, reach_m, floor, first, last))
-
-
-def supervised(
-    atp: Atp,
-    times: np.ndarray,
-    sections: np.ndarray,
-    period_s: float,
-    a_1_m_s2: float,
-    a_2_m_s2: float,
-) -> Limits:
-    """What is supervised: limits over time [n] of LIMIT, and what follows from `atp` and the track
-    [n] of track.SECTION. A_1, A_2: the largest acceleration with and without traction."""
-    static = static_speeds(atp)
-    speeds = np.zeros(len(static.values), SPEED)
-    speeds["from_m"], speeds["speed_m_s"] = static
-    made = _Tables()
-    if atp.supervision == "etcs":
-        delays = times_of(atp, period_s, a_1_m_s2, a_2_m_s2)
-        fastest = min(max(static.values), float(times["speed_m_s"].max()))
-        top_m_s = fastest + dv_ebi(fastest) + delays.delta_m_s + a_1_m_s2 * period_s + SPARE_M_S
-        gradient = gradients(sections, atp.train_length_m)
-        for before, after, place in zip(
-            static.values, static.values[1:], static.from_m[1:], strict=False
-        ):
-            if after < before:
-                _add_lower_speed(made, atp, delays, gradient, place, after, top_m_s)
-        if atp.end_of_authority_m is not None:
-            _add_authority(made, atp, delays, gradient, atp.end_of_authority_m, top_m_s)
-    return Limits(times, speeds, np.array(made.targets, TARGET), np.array(made.knots, KNOT))
-
-
-def _emergency_curves(
-    atp: Atp, delays: Times, points: list[Point]
-) -> dict[int, list[tuple[float, float, float, float]]]:
-    """The curves that follow from EBD."""
-    built_up_s = delays.traction + delays.berem
-    margin = delays.delta_m_s, delays.d_bec_m
-    return {
-        EBD: knots_of(points, 0.0, 0.0, 0.0),
-        EBI: knots_of(points, built_up_s, *margin),
-        SBI: knots_of(points, built_up_s + delays.bs2, *margin),
-        WARN: knots_of(points, built_up_s + delays.bs2 + atp.t_warning_s, *margin),
-        PERMITTED: knots_of(points, built_up_s + delays.bs2 + atp.t_driver_s, *margin),
-    }
-
-
-def _reach_m(atp: Atp, delays: Times, points: list[Point], speed_m_s: float) -> float:
-    """Where the permitted speed of EBD has come down to a speed."""
-    time_s = delays.traction + delays.berem + delays.bs2 + atp.t_driver_s
-    at_m = position_of(points, speed_m_s + delays.delta_m_s)
-    return at_m - speed_m_s * time_s - delays.d_bec_m
-
-
-def _add_lower_speed(
-    made: _Tables,
-    atp: Atp,
-    delays: Times,
-    gradient: Way,
-    place_m: float,
-    speed_m_s: float,
-    top_m_s: float,
-) -> None:
-    foot_m_s = speed_m_s + dv_ebi(speed_m_s)
-    points = deceleration_curve(
-        atp.emergency_brake, atp.safe_share, gradient, place_m, foot_m_s, top_m_s, speed_m_s
-    )
-    floors = {
-        PERMITTED: speed_m_s,
-        WARN: speed_m_s + dv_warning(speed_m_s),
-        SBI: speed_m_s + dv_sbi(speed_m_s),
-        EBI: speed_m_s + dv_ebi(speed_m_s),
-    }
-    reach_m = min(_reach_m(atp, delays, points, speed_m_s), place_m)
-    made.add(place_m, speed_m_s, reach_m, floors, _emergency_curves(atp, delays, points))
-
-
-def _add_authority(
-    made: _Tables, atp: Atp, delays: Times, gradient: Way, end_m: float, top_m_s: float
-) -> None:
-    service = deceleration_curve(atp.service_brake, 1.0, gradient, end_m, 0.0, top_m_s, 0.0)
-    made.add(
-        math.inf,
-        0.0,
-        end_m,
-        {},
-        {
-            SBI: knots_of(service, delays.bs1, 0.0, 0.0),
-            WARN: knots_of(service, delays.bs1 + atp.t_warning_s, 0.0, 0.0),
-            PERMITTED: knots_of(service, delays.bs1 + atp.t_driver_s, 0.0, 0.0),
-        },
-    )
-    emergency = deceleration_curve(
-        atp.emergency_brake, atp.safe_share, gradient, end_m + atp.overlap_m, 0.0, top_m_s, 0.0
-    )
-    reach_m = _reach_m(atp, delays, emergency, 0.0)
-    made.add(math.inf, 0.0, reach_m, {}, _emergency_curves(atp, delays, emergency))
-
-
-def braking_fault(atp: Atp, sections: np.ndarray) -> str:
-    """What is wrong with the brakes on this track [n] of track.SECTION, "" for nothing."""
-    if atp.supervision != "etcs":
-        return ""
-    steepest = -min(gradients(sections, atp.train_length_m).values)
-    for key, weakest in (
-        ("emergency_brake", atp.safe_share * atp.emergency_brake.weakest_m_s2),
-        ("service_brake", atp.service_brake.weakest_m_s2),
-    ):
-        if weakest - steepest < LEAST_DECELERATION_M_S2:
-            return (
-                f"atp.{key}: {weakest:g} m/s^2 does not hold the train on the steepest downhill,"
-                f" expected at least {steepest + LEAST_DECELERATION_M_S2:.3g}"
-            )
-    return ""

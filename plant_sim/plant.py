@@ -25,10 +25,10 @@ from ato_hil.can_dbc.codec import (
     RUN_CTRL,
     TRAIN_POSITION,
     TRAIN_SPEED,
-    choices,
     get,
     put,
     saturate,
+    values,
 )
 from ato_hil.can_dbc.step import int64, step
 from ato_hil.plant_sim import (
@@ -40,14 +40,13 @@ from ato_hil.plant_sim import (
 )
 from ato_hil.plant_sim.mail import received
 
-IDLE, ARMED, RUNNING, ENDED = 0, 1, 2, 3
-REAL_TIME = 1  # RUN_CTRL.Pace; 0 is the lockstep
+IDLE, ARMED, RUNNING, ENDED = values("RUN_CTRL", "RunState", "idle armed running ended")
+LOCKSTEP, REAL_TIME = values("RUN_CTRL", "Pace", "lockstep realtime")
 CONTROL_PERIOD_TICKS = 10  # RUN_CTRL comes every so many ticks
-NO_TARGET_M = 65535
+NO_TARGET_M = (1 << ATP_LIMIT.TargetDistance.length) - 1  # the largest that it can say
 TICK_MASK = 0xFFFF
 CARS_MAX = 8
-HOLD = choices("FORCE_CMD", "Mode")["hold"]
-EMERGENCY_REQUEST = choices("FORCE_CMD", "Mode")["emergency_request"]
+HOLD, EMERGENCY_REQUEST = values("FORCE_CMD", "Mode", "hold emergency_request")
 
 # Of ATP: where it steps in, and what it demands, as in ATP_LIMIT; NaN where nothing of the kind is
 # supervised.
@@ -353,6 +352,93 @@ def show_supervision(params: Any, state: Any, truth: Any) -> None:
 
 
 @step
+def begin_equipment(params: Any, state: Any) -> None:
+    """A run starts for all of a train but its motion."""
+    begin_node(state.node)
+    radio.reset(state.radio)
+    failures.reset(state.failures)
+    actuator.reset(state.actuator)
+    actuator.preset(state.actuator, int64(0), params.node.holding_force_n)
+    atp.reset(state.atp)
+    brakes.reset(state.brakes)
+
+
+@step
+def sense_train(params: Any, limits: Any, state: Any, chance: Any, tx: Any) -> None:
+    """What one train's sensors and ATP say in this tick, as frames."""
+    node = state.node
+    train = state.train
+    setting = params.node
+    tick = int64(node.tick)
+    atp.supervise(params.atp, limits, state.atp, tick, train.position_m, train.speed_m_s)
+    if tick % CONTROL_PERIOD_TICKS == 0:
+        e2e.send(node, tx, RUN_CTRL, control_word(node))
+    e2e.send(node, tx, ATP_LIMIT, limit_word(setting, state, tick))
+    rear = setting.rear_weight
+    position = train.position_m + rear * (
+        train.rear_position_m + setting.rear_offset_m - train.position_m
+    )
+    speed = train.speed_m_s + rear * (train.rear_speed_m_s - train.speed_m_s)
+    speed += setting.speed_noise_m_s * chance.speed_noise
+    speed, position = failures.measured(
+        params.failures, state.failures, node, speed, position, chance.speed_noise
+    )
+    position = quantised(position, setting.position_step_m)
+    speed = quantised(speed, setting.speed_step_m_s)
+    e2e.send(
+        node,
+        tx,
+        TRAIN_SPEED,
+        put(TRAIN_SPEED.Speed, raw_of(TRAIN_SPEED.Speed, speed))
+        + put(TRAIN_SPEED.Acceleration, raw_of(TRAIN_SPEED.Acceleration, train.acceleration_m_s2)),
+    )
+    e2e.send(
+        node,
+        tx,
+        TRAIN_POSITION,
+        put(TRAIN_POSITION.Position, raw_of(TRAIN_POSITION.Position, position))
+        + put(TRAIN_POSITION.Tick, tick & TICK_MASK),
+    )
+
+
+@step
+def read_train(params: Any, state: Any, rx: Any, truth: Any) -> None:
+    """Before a train model takes its command: the row of truth at the start of the tick, and the
+    command as the scenario's faults leave it."""
+    node = state.node
+    train = state.train
+    truth.position_m = train.position_m
+    truth.speed_m_s = train.speed_m_s
+    truth.acceleration_m_s2 = train.acceleration_m_s2
+    show_supervision(params.atp, state.atp, truth)
+    truth.traction_j = train.traction_j
+    truth.braking_j = train.braking_j
+    truth.recuperated_j = params.node.recuperation * train.braking_j
+    read_commands(params.node, node, rx)
+    radio.read(node, state.radio, rx)
+    fail(params.node, node, train)
+    failures.weaken(params.failures, state.failures, node)
+
+
+@step
+def act_train(params: Any, state: Any) -> None:
+    """After it has, before it moves: the actuators by a tick, and the safety brakes."""
+    failures.restore(state.failures, state.node)
+    actuator.shift(state.actuator)
+    order_brakes(params, state)
+    brakes.act(params.brakes, state.brakes, state.actuator, state.train.speed_m_s)
+
+
+@step
+def sense(params: Any, limits: Any, state: Any, chance: Any, tick: Any, tx: Any) -> None:
+    """The frames of tick `tick` to every controller of the line."""
+    for train in range(len(state)):
+        sense_train(params[train], limits, state[train], chance[train, tick], tx[train])
+    if len(state) > 1:
+        radio.exchange(params, state, chance, tick, tx)
+
+
+@step
 def no_coupler_force_n(train: Any) -> Any:
     """Of a model without couplers."""
     return 0.0
@@ -368,117 +454,33 @@ def build(model: Any) -> tuple[Any, Any, Any]:
     of codec.MAILBOX.
     """
     reset_train = model.reset
-    advance_train = model.advance
     command_train = model.command
+    advance_train = model.advance
     coupler_force_n = getattr(model, "coupler_force_n", no_coupler_force_n)
-
-    @step
-    def begin_train(params: Any, state: Any) -> None:
-        begin_node(state.node)
-        radio.reset(state.radio)
-        failures.reset(state.failures)
-        actuator.reset(state.actuator)
-        actuator.preset(state.actuator, int64(0), params.node.holding_force_n)
-        atp.reset(state.atp)
-        brakes.reset(state.brakes)
-        reset_train(params.train, state.train)
-
-    @step
-    def sense_train(params: Any, limits: Any, state: Any, chance: Any, tx: Any) -> None:
-        node = state.node
-        train = state.train
-        setting = params.node
-        tick = int64(node.tick)
-        atp.supervise(params.atp, limits, state.atp, tick, train.position_m, train.speed_m_s)
-        if tick % CONTROL_PERIOD_TICKS == 0:
-            e2e.send(node, tx, RUN_CTRL, control_word(node))
-        e2e.send(node, tx, ATP_LIMIT, limit_word(setting, state, tick))
-        rear = setting.rear_weight
-        position = train.position_m + rear * (
-            train.rear_position_m + setting.rear_offset_m - train.position_m
-        )
-        speed = train.speed_m_s + rear * (train.rear_speed_m_s - train.speed_m_s)
-        speed += setting.speed_noise_m_s * chance.speed_noise
-        speed, position = failures.measured(
-            params.failures, state.failures, node, speed, position, chance.speed_noise
-        )
-        position = quantised(position, setting.position_step_m)
-        speed = quantised(speed, setting.speed_step_m_s)
-        e2e.send(
-            node,
-            tx,
-            TRAIN_SPEED,
-            put(TRAIN_SPEED.Speed, raw_of(TRAIN_SPEED.Speed, speed))
-            + put(
-                TRAIN_SPEED.Acceleration, raw_of(TRAIN_SPEED.Acceleration, train.acceleration_m_s2)
-            ),
-        )
-        e2e.send(
-            node,
-            tx,
-            TRAIN_POSITION,
-            put(TRAIN_POSITION.Position, raw_of(TRAIN_POSITION.Position, position))
-            + put(TRAIN_POSITION.Tick, tick & TICK_MASK),
-        )
-
-    @step
-    def advance_train_and_actuators(
-        params: Any, track: Any, state: Any, chance: Any, rx: Any, truth: Any
-    ) -> None:
-        node = state.node
-        train = state.train
-        truth.position_m = train.position_m
-        truth.speed_m_s = train.speed_m_s
-        truth.acceleration_m_s2 = train.acceleration_m_s2
-        show_supervision(params.atp, state.atp, truth)
-        truth.traction_j = train.traction_j
-        truth.braking_j = train.braking_j
-        truth.recuperated_j = params.node.recuperation * train.braking_j
-        read_commands(params.node, node, rx)
-        radio.read(node, state.radio, rx)
-        fail(params.node, node, train)
-        failures.weaken(params.failures, state.failures, node)
-        command_train(params, state)
-        failures.restore(state.failures, node)
-        actuator.shift(state.actuator)
-        order_brakes(params, state)
-        brakes.act(params.brakes, state.brakes, state.actuator, train.speed_m_s)
-        advance_train(
-            params.train,
-            track,
-            train,
-            params.actuator,
-            state.actuator,
-            chance.disturbance_m_s2,
-        )
-        truth.force_n = train.force_n
-        truth.coupler_force_n = coupler_force_n(train)
-        node.tick += 1
 
     @step
     def begin(params: Any, state: Any) -> None:
         for train in range(len(state)):
-            begin_train(params[train], state[train])
-
-    @step
-    def sense(params: Any, limits: Any, state: Any, chance: Any, tick: Any, tx: Any) -> None:
-        for train in range(len(state)):
-            sense_train(params[train], limits, state[train], chance[train, tick], tx[train])
-        if len(state) > 1:
-            radio.exchange(params, state, chance, tick, tx)
+            begin_equipment(params[train], state[train])
+            reset_train(params[train].train, state[train].train)
 
     @step
     def actuate_and_advance(
         params: Any, track: Any, state: Any, chance: Any, tick: Any, rx: Any, truth: Any
     ) -> None:
-        for train in range(len(state)):
-            advance_train_and_actuators(
-                params[train],
-                track,
-                state[train],
-                chance[train, tick],
-                rx[train],
-                truth[train, tick],
+        for k in range(len(state)):
+            setting = params[k]
+            own = state[k]
+            row = truth[k, tick]
+            read_train(setting, own, rx[k], row)
+            command_train(setting, own)
+            act_train(setting, own)
+            disturbance = chance[k, tick].disturbance_m_s2
+            advance_train(
+                setting.train, track, own.train, setting.actuator, own.actuator, disturbance
             )
+            row.force_n = own.train.force_n
+            row.coupler_force_n = coupler_force_n(own.train)
+            own.node.tick += 1
 
     return begin, sense, actuate_and_advance

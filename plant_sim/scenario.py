@@ -22,9 +22,10 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.errors import InputError
+from ato_hil.can_dbc.errors import InputError, expected, validation
 from ato_hil.plant_sim.actuator import Actuator
-from ato_hil.plant_sim.atp import Atp, braking_fault
+from ato_hil.plant_sim.atp import Atp
+from ato_hil.plant_sim.atp_tables import braking_fault
 from ato_hil.plant_sim.line import Line
 from ato_hil.plant_sim.planner import PlanError, ProfilePlan, plan_profile
 from ato_hil.plant_sim.profile import (
@@ -222,8 +223,7 @@ def find(name: str) -> tuple[Path, str]:
     path = FOLDER / f"{file}.toml"
     if not path.is_file():
         raise ScenarioError(
-            f"scenario {file!r} is unknown, expected one of {', '.join(scenario_names())},"
-            " or a .toml file"
+            f"scenario {file!r} is unknown, {expected(file, scenario_names())}, or a .toml file"
         )
     return path, case
 
@@ -272,7 +272,7 @@ def _in_case(path: Path, case: str, content: dict[str, Any]) -> dict[str, Any]:
     if not case:
         return content
     if case not in cases:
-        known = f"expected one of {', '.join(cases)}" if cases else "the scenario has none"
+        known = expected(case, cases) if cases else "the scenario has none"
         raise ScenarioError(f"{path}: case {case!r} is unknown, {known}")
     return _merged(content, cases[case])
 
@@ -304,7 +304,7 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
     try:
         scenario = msgspec.convert(content, Scenario)
     except msgspec.ValidationError as error:
-        raise ScenarioError(f"{_place(path, case)}: {_where(str(error))}") from None
+        raise ScenarioError(f"{_place(path, case)}: {_where(error)}") from None
     _check(_place(path, case), scenario)
     try:
         segments = plan_profile(scenario.profile, scenario.period_s)
@@ -386,19 +386,19 @@ def _own_numbers(loaded: Loaded, line: Line, train: int) -> Scenario:
     where = f"{_place(loaded.path, loaded.case)}: key line.members[{which}]"
     unknown = set(own.laws) - set(loaded.scenario.laws)
     if unknown:
-        known = ", ".join(loaded.scenario.laws)
-        raise ScenarioError(f"{where}.laws.{unknown.pop()}: expected one of {known}")
+        name = unknown.pop()
+        raise ScenarioError(f"{where}.laws.{name}: {expected(name, loaded.scenario.laws)}")
     content = _merged(msgspec.to_builtins(loaded.scenario), msgspec.to_builtins(own))
     try:
         return msgspec.convert(content, Scenario)
     except msgspec.ValidationError as error:
-        raise ScenarioError(f"{where}: {_where(str(error))}") from None
+        raise ScenarioError(f"{where}: {_where(error)}") from None
 
 
-def _where(message: str) -> str:
+def _where(error: msgspec.ValidationError) -> str:
     """The validator's message with the key first: `train.masses_kg: Expected ...`."""
-    text, _, place = message.partition(" - at `$.")
-    return f"key {place.rstrip('`')}: {text}" if place else text
+    text, place = validation(error, Scenario)
+    return f"key {place.lstrip('.')}: {text}" if place else text
 
 
 def _check(path: str, scenario: Scenario) -> None:

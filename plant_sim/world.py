@@ -17,6 +17,7 @@ from ato_hil.can_dbc.step import INTERPRETED, step
 from ato_hil.plant_sim import (
     actuator,
     atp,
+    atp_tables,
     brakes,
     failures,
     plant,
@@ -169,11 +170,11 @@ def supervised(loaded: Loaded) -> atp.Limits:
     """What ATP supervises, for the steps."""
     scenario = loaded.scenario
     sections = track.sections(scenario.track)
-    steepest = min(atp.gradients(sections, 0.0).values)
+    steepest = min(atp_tables.gradients(sections, 0.0).values)
     rolling_m_s2 = max(-steepest, 0.0) + scenario.disturbance.amplitude_m_s2
     pulling_m_s2 = scenario.actuator.force_max_m_s2 + rolling_m_s2
     limits = limits_of(loaded)
-    made = atp.supervised(
+    made = atp_tables.supervised(
         scenario.atp, limits, sections, scenario.period_s, pulling_m_s2, rolling_m_s2
     )
     return atp.Limits(*map(rows, made))
@@ -205,7 +206,7 @@ def ceiling_of(loaded: Loaded) -> np.ndarray:
     times = limits_of(loaded)
     row = np.searchsorted(times["until_tick"], np.arange(loaded.ticks))
     by_time = times["speed_m_s"][np.minimum(row, len(times) - 1)]
-    way = atp.static_speeds(loaded.scenario.atp)
+    way = atp_tables.static_speeds(loaded.scenario.atp)
     place = np.searchsorted(way.from_m, loaded.profile.position_m, side="right") - 1
     return np.minimum(by_time, np.array(way.values)[place])
 

@@ -3,7 +3,8 @@
 1. `runs`: what a run is and what it leaves
 2. `trace`: what is seen of it
 3. `session`: how runs are made
-4. `campaigns`, `papers`: many runs for one question; each paper's claims, figures, reference
+4. `campaigns`, `papers`, `export`: many runs for one question; each paper's claims, figures,
+   reference; the firmware as C
 5. `verify`, `reports`, `bench`: evidence, pages, rates
 6. `cli`: the command line
 """

@@ -25,12 +25,12 @@ multiplies it by up to 1057.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import Record, int64, step
 from ato_hil.controller.laws.cailc import errors
 from ato_hil.controller.q import (
     clamp,
@@ -96,7 +96,7 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
 
 
 @step
-def adaptive(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def adaptive(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of the adaptive law."""
     if int64(inputs.tick) == 0:
         state.h = 0

@@ -31,12 +31,17 @@ theta is finer than the table of `controller/q.py`: one run changes it by 1e-7 o
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.interface import FAULT_BARRIER
 from ato_hil.controller.laws.cailc import barrier
 from ato_hil.controller.q import (
@@ -175,7 +180,7 @@ HALF_LOG2_E = round(0.7213475204444817 * 2**20)  # 1 / (2 ln 2), Q20
 
 
 @step
-def exponent(params: Any, rule: Any, inputs: Any) -> Any:
+def exponent(params: Record, rule: Int, inputs: Record) -> Int:
     """-log2 of mu_l, Q24, below 2^35."""
     multiple = int64(params.multiple[rule])
     centre = (multiple * int64(inputs.reference_position)) >> 16
@@ -192,7 +197,7 @@ def exponent(params: Any, rule: Any, inputs: Any) -> Any:
 
 
 @step
-def memberships(params: Any, state: Any, inputs: Any) -> None:
+def memberships(params: Record, state: Record, inputs: Record) -> None:
     """state.delta = normalised memberships (7), Q30, relative to the nearest rule: their sum is at
     least 1 before it is divided by."""
     g_0 = exponent(params, 0, inputs)
@@ -212,7 +217,7 @@ def memberships(params: Any, state: Any, inputs: Any) -> None:
 
 
 @step
-def increments(params: Any, state: Any, alpha: Any, v: Any, v2: Any, cell: Any) -> None:
+def increments(params: Record, state: Record, alpha: Int, v: Int, v2: Int, cell: Record) -> None:
     """cell.learn = -Gamma xi alpha and kappa |alpha|; alpha Q24, v/64 and its square Q30.
 
     Every product is one of two int32 or less than 2^62.
@@ -230,7 +235,7 @@ def increments(params: Any, state: Any, alpha: Any, v: Any, v2: Any, cell: Any) 
 
 
 @step
-def switching(phi: Any, inverse_eps: Any) -> Any:
+def switching(phi: Int, inverse_eps: Int) -> Int:
     """sgn(phi), or sat(phi / eps), Q30; 1 / eps in Q16, 0: sgn."""
     one = int64(1) << 30
     if inverse_eps != 0:
@@ -239,7 +244,7 @@ def switching(phi: Any, inverse_eps: Any) -> Any:
 
 
 @step
-def afilc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def afilc(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of AFILC."""
     e1 = sat32((int64(inputs.reference_position) - int64(inputs.position)) << 9)
     e2 = sat32(int64(inputs.reference_speed) - int64(inputs.speed))

@@ -26,12 +26,17 @@ those of `afilc`.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.interface import FAULT_BARRIER
 from ato_hil.controller.laws.afilc import (
     SPEED_MAX,
@@ -130,7 +135,7 @@ def learned(gains: Gains, vehicle: Vehicle) -> tuple[list[int], list[int], list[
 
 
 @step
-def increments(params: Any, alpha: Any, v: Any, v2: Any, cell: Any) -> None:
+def increments(params: Record, alpha: Int, v: Int, v2: Int, cell: Record) -> None:
     """cell.learn = -Ts Gamma xi alpha and Ts kappa |alpha|, for the rules to share; alpha Q24, v/64
     and its square Q30. Every product is one of two int32, |v2| is at most 2^31."""
     alpha_v = sat32(round_shift(alpha * v, 30))
@@ -143,7 +148,9 @@ def increments(params: Any, alpha: Any, v: Any, v2: Any, cell: Any) -> None:
 
 
 @step
-def afilc_track(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def afilc_track(
+    params: Record, state: Record, cell: Record, inputs: Record, outputs: Record
+) -> None:
     """One tick of AFILC along the track."""
     e1 = sat32((int64(inputs.reference_position) - int64(inputs.position)) << 9)
     e2 = sat32(int64(inputs.reference_speed) - int64(inputs.speed))

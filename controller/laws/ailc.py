@@ -12,12 +12,10 @@ m/s^2, 24.3 kN for the paper's train) and never wrap. Symbols, units and formats
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import Record, int64, step
 from ato_hil.controller.laws import cailc
 from ato_hil.controller.laws.cailc import errors, force, increments
 from ato_hil.controller.q import (
@@ -70,7 +68,7 @@ def words_stored(gains: Gains) -> int:
 
 
 @step
-def ailc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def ailc(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of AILC."""
     ed = errors(params, state, inputs)
     delta = int64(state.delta)

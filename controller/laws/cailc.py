@@ -28,12 +28,17 @@ theta is finer than the table of `controller/q.py`: one run changes it by 1e-6 o
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.interface import FAULT_BARRIER
 from ato_hil.controller.q import (
     clamp,
@@ -125,7 +130,7 @@ def learned(gains: Gains, vehicle: Vehicle) -> tuple[list[int], list[int], list[
 
 
 @step
-def barrier(delta: Any, nu_b: Any, inverse_nu_b: Any, s_min: Any) -> Any:
+def barrier(delta: Int, nu_b: Int, inverse_nu_b: Int, s_min: Int) -> Int:
     """chi = delta / cos^2(pi/2 r), Q24 saturated to +-128; cos(pi/2 r) = sin(pi/2 (1 - r)); one
     division."""
     ratio = (clamp(delta, -nu_b, nu_b) * inverse_nu_b) >> 10  # delta / nu_b in [-1, 1], Q30
@@ -137,7 +142,7 @@ def barrier(delta: Any, nu_b: Any, inverse_nu_b: Any, s_min: Any) -> Any:
 
 
 @step
-def errors(params: Any, state: Any, inputs: Any) -> Any:
+def errors(params: Record, state: Record, inputs: Record) -> Int:
     """ed, Q24; writes state.delta = alpha e + ed, Q24, with e limited to +-16 m."""
     e = clamp(
         (int64(inputs.position) - int64(inputs.reference_position)) << 9,
@@ -150,7 +155,7 @@ def errors(params: Any, state: Any, inputs: Any) -> Any:
 
 
 @step
-def increments(params: Any, chi: Any, speed: Any, cell: Any) -> None:
+def increments(params: Record, chi: Int, speed: Int, cell: Record) -> None:
     """cell.learn = Gamma xi chi / M with xi = [-1, -v, -v^2]; chi Q24, v Q22."""
     chi_v = round_shift(chi * speed, 22)
     # Beyond 2^37 (8192 m^3/s^3) every theta is at its bound anyway; the product with Gamma stays
@@ -163,15 +168,15 @@ def increments(params: Any, chi: Any, speed: Any, cell: Any) -> None:
 
 @step
 def force(
-    params: Any,
-    theta_1: Any,
-    theta_2: Any,
-    theta_3: Any,
-    speed: Any,
-    inputs: Any,
-    ed: Any,
-    delta: Any,
-) -> Any:
+    params: Record,
+    theta_1: Int,
+    theta_2: Int,
+    theta_3: Int,
+    speed: Int,
+    inputs: Record,
+    ed: Int,
+    delta: Int,
+) -> Int:
     """(31) divided by M, Q27: learned resistance, acceleration, damping; limited to what the
     actuators give."""
     v2 = (speed * speed) >> 28  # Q16
@@ -186,7 +191,7 @@ def force(
 
 
 @step
-def cailc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def cailc(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of CAILC."""
     ed = errors(params, state, inputs)
     delta = int64(state.delta)

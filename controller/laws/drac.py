@@ -48,12 +48,17 @@ eta by 10^4 psi z2.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller import characteristic
 from ato_hil.controller.q import (
     INT32_MAX,
@@ -249,14 +254,14 @@ def eta_of(gains: ModelGains, theta: tuple[float, float, float]) -> list[float]:
 
 
 @step
-def begin_track(track: Any) -> None:
+def begin_track(track: Record) -> None:
     """No error, no limit: a run starts."""
     track.e2 = 0
     track.limited = 0
 
 
 @step
-def begin_model(params: Any, model: Any) -> None:
+def begin_model(params: Record, model: Record) -> None:
     """The initial estimates: a run starts."""
     for i in range(3):
         model.eta[i] = params.eta_initial[i]
@@ -265,7 +270,7 @@ def begin_model(params: Any, model: Any) -> None:
 
 
 @step
-def errors(params: Any, track: Any, inputs: Any) -> None:
+def errors(params: Record, track: Record, inputs: Record) -> None:
     """track.z1, clamped, and track.e2, filtered."""
     e2 = sat32(int64(inputs.speed) - int64(inputs.reference_speed))
     old = int64(track.e2)
@@ -277,7 +282,7 @@ def errors(params: Any, track: Any, inputs: Any) -> None:
 
 
 @step
-def wanted_acceleration(params: Any, track: Any, loop: Any, inputs: Any) -> None:
+def wanted_acceleration(params: Record, track: Record, loop: Record, inputs: Record) -> None:
     """loop.z2 and loop.q."""
     c1 = int64(params.c1)
     e2 = int64(track.e2)
@@ -290,13 +295,13 @@ def wanted_acceleration(params: Any, track: Any, loop: Any, inputs: Any) -> None
 
 
 @step
-def feed_forward(inputs: Any) -> Any:
+def feed_forward(inputs: Record) -> Int:
     """a* + w(x), m/s^2, Q28."""
     return sat32((int64(inputs.ahead_acceleration) + int64(inputs.map_acceleration)) << 1)
 
 
 @step
-def at_stop(inputs: Any) -> Any:
+def at_stop(inputs: Record) -> Int:
     """1 when the reference has come to its end and the train stands: the brake holds it."""
     arrived = (
         int64(inputs.reference_speed) == 0
@@ -307,13 +312,13 @@ def at_stop(inputs: Any) -> Any:
 
 
 @step
-def brake_at_stop(params: Any) -> Any:
+def brake_at_stop(params: Record) -> Int:
     """Specific force that holds the train, m/s^2, Q27."""
     return clamp(int64(params.hold), -int64(params.characteristic.force_max), int64(0))
 
 
 @step
-def limit(params: Any, track: Any, inputs: Any, wanted: Any) -> Any:
+def limit(params: Record, track: Record, inputs: Record, wanted: Int) -> Int:
     """`wanted` (Q27) within the characteristic; track.limited says whether that changed it."""
     most = characteristic.largest_force(params.characteristic, int64(inputs.speed))
     track.limited = 0
@@ -325,7 +330,7 @@ def limit(params: Any, track: Any, inputs: Any, wanted: Any) -> Any:
 
 
 @step
-def regressor(params: Any, model: Any, inputs: Any) -> None:
+def regressor(params: Record, model: Record, inputs: Record) -> None:
     """model.psi and model.prior = theta_nominal' phi at the measured speed."""
     v = int64(inputs.speed)
     v2 = (v * v) >> 32  # Q16
@@ -340,7 +345,7 @@ def regressor(params: Any, model: Any, inputs: Any) -> None:
 
 
 @step
-def demand(model: Any, q: Any) -> Any:
+def demand(model: Record, q: Int) -> Int:
     """b = thetahat' phi + q with the present estimates, m/s^2, Q28."""
     product = int64(0)  # below 3 * 2^27 * 2^31
     for i in range(3):
@@ -349,13 +354,13 @@ def demand(model: Any, q: Any) -> Any:
 
 
 @step
-def specific_force(model: Any, b: Any) -> Any:
+def specific_force(model: Record, b: Int) -> Int:
     """f = mu b, m/s^2, Q27."""
     return sat32(round_shift(int64(model.mu) * b, 30))
 
 
 @step
-def adapting_error(params: Any, model: Any, b: Any, z2: Any) -> Any:
+def adapting_error(params: Record, model: Record, b: Int, z2: Int) -> Int:
     """z2 of the adaptation, m/s, Q28 in +-8 m/s: capped so that w_a^2 stays below wmax2."""
     limited = clamp(z2, -(int64(1) << 27), (int64(1) << 27) - 1)
     if int64(params.cap) == 0:
@@ -370,21 +375,21 @@ def adapting_error(params: Any, model: Any, b: Any, z2: Any) -> Any:
 
 
 @step
-def eta_step(params: Any, model: Any, z: Any, i: Any) -> Any:
+def eta_step(params: Record, model: Record, z: Int, i: Int) -> Int:
     """Euler step of eta_i, Q26; z is the adapting error, Q28."""
     product = sat32(round_shift(int64(model.psi[i]) * z, 23))  # Q35
     return -round_shift(product * int64(params.rate[i]), 25)
 
 
 @step
-def mu_step(params: Any, b: Any, z: Any) -> Any:
+def mu_step(params: Record, b: Int, z: Int) -> Int:
     """Euler step of mu, Q29."""
     product = sat32(round_shift(b * z, 27))  # Q29
     return -round_shift(product * int64(params.mass_rate), 27)
 
 
 @step
-def frozen(params: Any, model: Any, track: Any, inputs: Any) -> Any:
+def frozen(params: Record, model: Record, track: Record, inputs: Record) -> Int:
     """1 if this tick must not adapt; counts such ticks."""
     limited = int64(track.limited) != 0 or int64(inputs.limited) != 0
     if int64(params.freeze) != 0 and limited:
@@ -394,7 +399,7 @@ def frozen(params: Any, model: Any, track: Any, inputs: Any) -> Any:
 
 
 @step
-def report(params: Any, track: Any, loop: Any, model: Any, outputs: Any) -> None:
+def report(params: Record, track: Record, loop: Record, model: Record, outputs: Record) -> None:
     """The estimates in the paper's units."""
     outputs.status = 0
     outputs.estimate[0] = sat32(round_shift(int64(model.mu) * int64(params.mass), 21))
@@ -407,7 +412,7 @@ def report(params: Any, track: Any, loop: Any, model: Any, outputs: Any) -> None
 
 
 @step
-def adapt(params: Any, model: Any, loop: Any) -> None:
+def adapt(params: Record, model: Record, loop: Record) -> None:
     """The estimates one tick on."""
     b = demand(model, int64(loop.q))
     z = adapting_error(params, model, b, int64(loop.z2))
@@ -417,7 +422,7 @@ def adapt(params: Any, model: Any, loop: Any) -> None:
 
 
 @step
-def drac(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def drac(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of Theorem 1."""
     track = state.track
     loop = state.loop

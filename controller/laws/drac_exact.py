@@ -13,11 +13,15 @@ z1, z2, q and phi as in `drac`. With wrong numbers it is the law that does not a
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.laws.drac import (
     LOOP_PARAMS,
     LOOP_STATE,
@@ -84,7 +88,7 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
 
 
 @step
-def sine(phase: Any) -> Any:
+def sine(phase: Int) -> Int:
     """Sine, Q30, of a phase in 2^-32 turns."""
     quarter = (phase >> 30) & 3
     part = phase & ((1 << 30) - 1)
@@ -95,13 +99,13 @@ def sine(phase: Any) -> Any:
 
 
 @step
-def coefficient(params: Any, swing: Any, i: Any) -> Any:
+def coefficient(params: Record, swing: Int, i: Int) -> Int:
     """theta_i now; swing is the sine, Q30."""
     return int64(params.theta[i]) + round_shift(int64(params.swing[i]) * swing, 30)
 
 
 @step
-def resistance(params: Any, inputs: Any) -> Any:
+def resistance(params: Record, inputs: Record) -> Int:
     """theta(t)' phi, m/s^2, Q28."""
     swing = sine(int64(inputs.tick) * int64(params.rate))
     v = int64(inputs.speed)
@@ -115,7 +119,9 @@ def resistance(params: Any, inputs: Any) -> Any:
 
 
 @step
-def drac_exact(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def drac_exact(
+    params: Record, state: Record, cell: Record, inputs: Record, outputs: Record
+) -> None:
     """One tick with known parameters."""
     track = state.track
     loop = state.loop

@@ -31,11 +31,14 @@ Paper's errors: (24) has its branches swapped; as printed, the estimates leave t
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.laws.drac import (
     LOOP_PARAMS,
     LOOP_STATE,
@@ -167,13 +170,13 @@ def _calibrate_ball(gains: Gains, vehicle: Vehicle) -> np.ndarray:
 
 
 @step
-def bounded(eta: Any) -> Any:
+def bounded(eta: Int) -> Int:
     """`eta` within its format: no one in the ball is near its ends."""
     return clamp(eta, -int64(ETA_MAX), int64(ETA_MAX))
 
 
 @step
-def squared(model: Any) -> Any:
+def squared(model: Record) -> Int:
     """|eta|^2, Q52, below 2^60."""
     total = int64(0)
     for i in range(3):
@@ -182,7 +185,7 @@ def squared(model: Any) -> Any:
 
 
 @step
-def weighted(params: Any, model: Any) -> Any:
+def weighted(params: Record, model: Record) -> Int:
     """sum w_i eta_i^2, Q30."""
     total = int64(0)  # each at most 2^24 * 2^36
     for i in range(3):
@@ -192,7 +195,7 @@ def weighted(params: Any, model: Any) -> Any:
 
 
 @step
-def smooth(params: Any, model: Any, ball: Any) -> Any:
+def smooth(params: Record, model: Record, ball: Record) -> Int:
     """Turns ball.change along the sphere in the outer layer of the ball; 1 if it did."""
     layer = round_shift(squared(model), 24) - int64(params.inner)  # Q28, up to 2^36
     outward = int64(0)  # eta' d, Q52, up to 3 * 2^29 * 2^28
@@ -212,7 +215,7 @@ def smooth(params: Any, model: Any, ball: Any) -> Any:
 
 
 @step
-def towards(params: Any, model: Any, excess: Any) -> None:
+def towards(params: Record, model: Record, excess: Int) -> None:
     """A Newton step to the closest point of the ball; excess = |eta|^2 - M0^2 > 0, Q52."""
     # Beyond 16 the radial step does the rest.
     # (Q52 + 6) / 2 / Q30: Q28
@@ -225,7 +228,7 @@ def towards(params: Any, model: Any, excess: Any) -> None:
 
 
 @step
-def shrink(params: Any, model: Any, excess: Any) -> None:
+def shrink(params: Record, model: Record, excess: Int) -> None:
     """The radial step, rounded inwards."""
     over = min((excess >> 24) + 1, int64(1) << 32)  # Q28, rounded up
     half = min(((over * int64(params.half_inverse)) >> 30) + 1, int64(1) << 28)  # k/2, Q28
@@ -237,7 +240,7 @@ def shrink(params: Any, model: Any, excess: Any) -> None:
 
 
 @step
-def project(params: Any, model: Any) -> Any:
+def project(params: Record, model: Int) -> Int:
     """eta into the ball; 1 if it was outside."""
     radius = int64(params.radius) << 24
     if squared(model) <= radius:
@@ -253,7 +256,7 @@ def project(params: Any, model: Any) -> Any:
 
 
 @step
-def adapt(params: Any, loop: Any, model: Any, ball: Any) -> None:
+def adapt(params: Record, loop: Record, model: Record, ball: Record) -> None:
     """The estimates one tick on."""
     b = demand(model, int64(loop.q))
     z = adapting_error(params.model, model, b, int64(loop.z2))
@@ -271,7 +274,9 @@ def adapt(params: Any, loop: Any, model: Any, ball: Any) -> None:
 
 
 @step
-def drac_robust(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def drac_robust(
+    params: Record, state: Record, cell: Record, inputs: Record, outputs: Record
+) -> None:
     """One tick of Theorem 2."""
     track = state.track
     loop = state.loop

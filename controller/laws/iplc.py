@@ -46,12 +46,12 @@ z_s is finer than a position: in Q15 Ts z_v rounds to zero below 1.5 mm/s and z_
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import Int, Record, int64, step
 from ato_hil.controller.interface import ESTIMATES_MAX
 from ato_hil.controller.q import (
     clamp,
@@ -270,7 +270,7 @@ def recall(gains: Gains) -> Recall:
 
 
 @step
-def begin(state: Any) -> None:
+def begin(state: Record) -> None:
     """A run starts."""
     state.dv = 0
     state.ds = 0
@@ -287,13 +287,13 @@ def begin(state: Any) -> None:
 
 
 @step
-def first_word(params: Any) -> Any:
+def first_word(params: Record) -> Int:
     """Of the estimator; its words are words of the cell whatever the calibration says."""
     return clamp(int64(params.estimator), int64(0), int64(INPUT + HORIZON_MAX))
 
 
 @step
-def limited_phi(component: Any, phi: Any) -> Any:
+def limited_phi(component: Int, phi: Int) -> Int:
     """phi1 (component 0) or phi2 inside its bounds, Q30: (14)."""
     if component == 0:
         return clamp(phi, int64(PHI_1_MIN), int64(PHI_1_MAX))
@@ -301,13 +301,13 @@ def limited_phi(component: Any, phi: Any) -> Any:
 
 
 @step
-def next_speed(phi_1: Any, phi_2: Any, v: Any, s: Any) -> Any:
+def next_speed(phi_1: Int, phi_2: Int, v: Int, s: Int) -> Int:
     """First row of A [v, s], Q24: Q30 times Q24, Q30 times Q15; v and s fit int32."""
     return round_shift(phi_1 * v, 30) + round_shift(phi_2 * s, 21)
 
 
 @step
-def estimate(params: Any, state: Any, cell: Any, dv: Any, initial: Any) -> None:
+def estimate(params: Record, state: Record, cell: Record, dv: Int, initial: Int) -> None:
     """(13), (14), (17), (18) for the tick before, into the words that the memory keeps for it; in
     run 0 the words begin anew."""
     first = first_word(params)
@@ -342,7 +342,7 @@ def estimate(params: Any, state: Any, cell: Any, dv: Any, initial: Any) -> None:
 
 
 @step
-def adapt(params: Any, state: Any, cell: Any, component: Any, phi: Any) -> None:
+def adapt(params: Record, state: Record, cell: Record, component: Int, phi: Int) -> None:
     """(17), (18) for phi1 (component 0) or phi2; the new estimate comes before the older ones.
 
     One division: the error over delta + |psi|^2, then spread over psi.
@@ -369,7 +369,7 @@ def adapt(params: Any, state: Any, cell: Any, component: Any, phi: Any) -> None:
 
 
 @step
-def recall_psi(params: Any, state: Any, cell: Any) -> None:
+def recall_psi(params: Record, state: Record, cell: Record) -> None:
     """state.psi for run n: what the last run estimated, or phi = [1, 0]."""
     first = first_word(params)
     for w in range(2 * ORDER):
@@ -379,7 +379,7 @@ def recall_psi(params: Any, state: Any, cell: Any) -> None:
 
 
 @step
-def predict(params: Any, state: Any, cell: Any) -> None:
+def predict(params: Record, state: Record, cell: Record) -> None:
     """(15), (16): state.psi from run n+l-1 to run n+l."""
     for component in range(2):
         psi = component * ORDER
@@ -393,7 +393,7 @@ def predict(params: Any, state: Any, cell: Any) -> None:
 
 
 @step
-def deviate(params: Any, state: Any, cell: Any, inputs: Any, dv: Any, ds: Any) -> None:
+def deviate(params: Record, state: Record, cell: Record, inputs: Record, dv: Int, ds: Int) -> None:
     """-dH: row 0 from the last run and this tick, the others z_l := A_{n+l} z_l."""
     period = int64(params.period)
     recall_psi(params, state, cell)
@@ -418,7 +418,7 @@ def deviate(params: Any, state: Any, cell: Any, inputs: Any, dv: Any, ds: Any) -
 
 
 @step
-def input_before(params: Any, cell: Any, row: Any) -> Any:
+def input_before(params: Record, cell: Record, row: Int) -> Int:
     """U_{n-1}(k)[row], Q29; that of row 0 is averaged over the ticks around k."""
     force_max = int64(params.force_max)
     if row == 0:
@@ -427,7 +427,7 @@ def input_before(params: Any, cell: Any, row: Any) -> Any:
 
 
 @step
-def optimise(params: Any, state: Any, cell: Any) -> None:
+def optimise(params: Record, state: Record, cell: Record) -> None:
     """(21): state.plan = F U_{n-1}(k) + P dH(k).
 
     |F U| < 8 * 2^29 * 2^30 = 2^62, |P dH| < 8 * 2^26 * 2^31 = 2^60.
@@ -453,7 +453,7 @@ def optimise(params: Any, state: Any, cell: Any) -> None:
 
 
 @step
-def feedback(kfv: Any, kfs: Any, inputs: Any) -> Any:
+def feedback(kfv: Int, kfs: Int, inputs: Record) -> Int:
     """kfv (v_d - v) + kfs (s_d - s), N/kg, Q29."""
     e_v = sat32(int64(inputs.reference_speed) - int64(inputs.speed))
     e_s = sat32(int64(inputs.reference_position) - int64(inputs.position))
@@ -461,7 +461,7 @@ def feedback(kfv: Any, kfs: Any, inputs: Any) -> Any:
 
 
 @step
-def limited_input(params: Any, state: Any, wanted: Any) -> Any:
+def limited_input(params: Record, state: Record, wanted: Int) -> Int:
     """`wanted` inside what slope and actuators allow, Q29."""
     force_max = int64(params.force_max)
     slope = int64(params.slope_max)
@@ -471,7 +471,7 @@ def limited_input(params: Any, state: Any, wanted: Any) -> Any:
 
 
 @step
-def follow_plan(params: Any, state: Any, cell: Any) -> None:
+def follow_plan(params: Record, state: Record, cell: Record) -> None:
     """z_l := A z_l + b (U[l] - before_l): what the plan moves the state by from run to run."""
     for row in range(1, HORIZON_MAX):
         if row < int64(params.horizon):
@@ -483,7 +483,7 @@ def follow_plan(params: Any, state: Any, cell: Any) -> None:
 
 
 @step
-def remember(params: Any, state: Any, cell: Any, inputs: Any) -> None:
+def remember(params: Record, state: Record, cell: Record, inputs: Record) -> None:
     """What the next run needs of this tick; a word that is not stored goes nowhere."""
     cell.learn[SPEED] = inputs.speed
     cell.learn[POSITION] = inputs.position
@@ -494,7 +494,7 @@ def remember(params: Any, state: Any, cell: Any, inputs: Any) -> None:
 
 
 @step
-def iplc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def iplc(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of IPLC, or of run 0."""
     if int64(inputs.tick) == 0:
         begin(state)

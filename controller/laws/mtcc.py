@@ -43,12 +43,17 @@ one tick changes fh by 1e-12.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller import separation
 from ato_hil.controller.interface import FAULT_BARRIER, SIDES
 from ato_hil.controller.q import (
@@ -214,20 +219,20 @@ def calibrate_barrier(gains: CommonGains) -> np.ndarray:
 
 
 @step
-def position_error(inputs: Any) -> Any:
+def position_error(inputs: Record) -> Int:
     """e, m, Q24, limited to +-64."""
     away = int64(inputs.position) - int64(inputs.reference_position)
     return clamp(away << 9, -int64(E_MAX), int64(E_MAX))
 
 
 @step
-def speed_error(inputs: Any) -> Any:
+def speed_error(inputs: Record) -> Int:
     """ev, m/s, Q24."""
     return sat32(int64(inputs.speed) - int64(inputs.reference_speed))
 
 
 @step
-def barrier(params: Any, e: Any) -> Any:
+def barrier(params: Record, e: Int) -> Int:
     """B(e), m/s^2, Q27; one division."""
     inside = clamp(e, -int64(params.edge), int64(params.edge))
     z = (inside * int64(params.inverse_k)) >> 10  # e / k, Q30
@@ -239,7 +244,7 @@ def barrier(params: Any, e: Any) -> Any:
 
 
 @step
-def consensus(params: Any, inputs: Any) -> Any:
+def consensus(params: Record, inputs: Record) -> Int:
     """u3 over the neighbours whose data count, m/s^2, Q27."""
     total = int64(0)
     for side in range(SIDES):
@@ -249,7 +254,7 @@ def consensus(params: Any, inputs: Any) -> Any:
 
 
 @step
-def bounds(params: Any, inputs: Any, e: Any, outputs: Any) -> Any:
+def bounds(params: Record, inputs: Record, e: Int, outputs: Record) -> Int:
     """What barrier and neighbours ask for: u2 + u3 - B, m/s^2, Q27; reports it."""
     held = barrier(params.barrier, e)
     u2 = separation.push_of_neighbours(params.separation, inputs)
@@ -262,13 +267,13 @@ def bounds(params: Any, inputs: Any, e: Any, outputs: Any) -> Any:
 
 
 @step
-def begin_common(state: Any) -> None:
+def begin_common(state: Record) -> None:
     """A run starts."""
     state.frozen = 0
 
 
 @step
-def limited(params: Any, state: Any, inputs: Any, wanted: Any) -> Any:
+def limited(params: Record, state: Record, inputs: Record, wanted: Int) -> Int:
     """1 if the command that `wanted` (m/s^2, Q27) becomes must not teach; writes state.command."""
     most = int64(params.force_max)
     within = clamp(wanted, -most, most)
@@ -285,13 +290,13 @@ def limited(params: Any, state: Any, inputs: Any, wanted: Any) -> Any:
 
 
 @step
-def speed_of(inputs: Any) -> Any:
+def speed_of(inputs: Record) -> Int:
     """v, m/s, Q22, limited to +-32."""
     return clamp(int64(inputs.speed) >> 2, -int64(V_MAX), int64(V_MAX))
 
 
 @step
-def resistance(state: Any, v: Any) -> Any:
+def resistance(state: Record, v: Int) -> Int:
     """fh + a1h v + a2h v^2, m/s^2, Q27."""
     v2 = (v * v) >> 28  # Q16, at most 2^26
     return (
@@ -302,7 +307,7 @@ def resistance(state: Any, v: Any) -> Any:
 
 
 @step
-def adapt(params: Any, state: Any, s: Any, v: Any) -> None:
+def adapt(params: Record, state: Record, s: Int, v: Int) -> None:
     """The estimates a tick on; s Q24 in +-4, v Q22 in +-32."""
     s_v = round_shift(s * v, 22)  # Q24, at most 2^31
     s_v2 = round_shift(s_v * v, 28)  # Q18, at most 2^30
@@ -322,7 +327,7 @@ def adapt(params: Any, state: Any, s: Any, v: Any) -> None:
 
 
 @step
-def adapting_error(params: Any, e: Any, ev: Any) -> Any:
+def adapting_error(params: Record, e: Int, ev: Int) -> Int:
     """s, m/s, Q24, of errors limited to 2 m and 2 m/s."""
     near = clamp(e, -int64(S_E_MAX), int64(S_E_MAX))
     slow = clamp(ev, -int64(S_EV_MAX), int64(S_EV_MAX))
@@ -330,7 +335,7 @@ def adapting_error(params: Any, e: Any, ev: Any) -> Any:
 
 
 @step
-def mtcc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def mtcc(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of the adaptive cooperative law."""
     common = params.common
     if int64(inputs.tick) == 0:

@@ -15,12 +15,12 @@ of position errors, which supports it and does not prove it.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import Record, int64, step
 from ato_hil.controller.q import clamp, round_shift, sat32
 from ato_hil.controller.quantise import Vehicle, fixed
 
@@ -72,7 +72,7 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
 
 
 @step
-def mtcc_pid(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def mtcc_pid(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of the PID baseline."""
     if int64(inputs.tick) == 0:
         state.total = 0

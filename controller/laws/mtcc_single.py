@@ -21,11 +21,14 @@ Not in the paper: the damping Th psi^2 is limited (damping_max), and beta is add
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.laws.mtcc import (
     COMMON_ESTIMATES,
     COMMON_PARAMS,
@@ -98,7 +101,7 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
 
 
 @step
-def psi_squared(inputs: Any) -> Any:
+def psi_squared(inputs: Record) -> Int:
     """psi^2, Q12, at most 2^32.1."""
     v = abs(speed_of(inputs))
     psi = (int64(1) << 20) + (v >> 2) + ((v * v) >> 24)  # Q20
@@ -106,14 +109,14 @@ def psi_squared(inputs: Any) -> Any:
 
 
 @step
-def damping(params: Any, state: Any, psi2: Any) -> Any:
+def damping(params: Record, state: Record, psi2: Int) -> Int:
     """Th psi^2 + beta, 1/s, Q20."""
     product = round_shift(round_shift(int64(state.theta), 24) * psi2, 20)  # Q28 * Q12
     return sat32(min(product, int64(params.damping_max)) + int64(params.damping))
 
 
 @step
-def adapt(params: Any, state: Any, psi2: Any, ev: Any) -> None:
+def adapt(params: Record, state: Record, psi2: Int, ev: Int) -> None:
     """Th a tick on."""
     slow = clamp(ev, -int64(EV_MAX), int64(EV_MAX))
     square = (slow * slow) >> 16  # Q32, at most 2^30
@@ -124,7 +127,9 @@ def adapt(params: Any, state: Any, psi2: Any, ev: Any) -> None:
 
 
 @step
-def mtcc_single(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def mtcc_single(
+    params: Record, state: Record, cell: Record, inputs: Record, outputs: Record
+) -> None:
     """One tick of the law with one estimate."""
     common = params.common
     if int64(inputs.tick) == 0:

@@ -9,12 +9,10 @@ orders of magnitude better with the same weights. Law, symbols and formats: cont
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import step
+from ato_hil.can_dbc.step import Record, step
 from ato_hil.controller.laws import iplc as iplc_law
 from ato_hil.controller.laws.iplc import iplc
 from ato_hil.controller.quantise import Recall, Vehicle
@@ -53,6 +51,8 @@ def recall(gains: Gains) -> Recall:
 
 
 @step
-def norm_optimal(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def norm_optimal(
+    params: Record, state: Record, cell: Record, inputs: Record, outputs: Record
+) -> None:
     """One tick: IPLC's, whose params hold the horizon 1."""
     iplc(params, state, cell, inputs, outputs)

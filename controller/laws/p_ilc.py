@@ -16,12 +16,15 @@ u is the force on a kilogram: open loop within a run. The learned word is u_k - 
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import (
+    Int,
+    Record,
+    int64,
+    step,
+)
 from ato_hil.controller.q import clamp, round_shift, sat32
 from ato_hil.controller.quantise import Vehicle, fixed
 
@@ -83,7 +86,7 @@ def learned(gains: Gains, vehicle: Vehicle) -> tuple[list[int], list[int], list[
 
 
 @step
-def initial_force(params: Any, inputs: Any) -> Any:
+def initial_force(params: Record, inputs: Record) -> Int:
     """u_0, m/s^2, Q30; below 2^36 for any reference."""
     speed = int64(inputs.reference_speed)
     square = round_shift(speed * speed, 30)  # v^2 / 64^2, Q30
@@ -95,7 +98,7 @@ def initial_force(params: Any, inputs: Any) -> Any:
 
 
 @step
-def p_ilc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def p_ilc(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of the P-type learning law: plays u_k, and learns from the errors."""
     e1 = int64(inputs.reference_position) - int64(inputs.position)  # Q15, below 2^32
     e2 = sat32(int64(inputs.reference_speed) - int64(inputs.speed))

@@ -14,12 +14,10 @@ what the memory holds by the PID's force, so that a second run 0 begins the lear
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import Record, int64, step
 from ato_hil.controller.laws import pid as pid_law
 from ato_hil.controller.laws.pid import pid
 from ato_hil.controller.q import clamp, round_shift, sat32
@@ -74,7 +72,7 @@ def learned(gains: Gains, vehicle: Vehicle) -> tuple[list[int], list[int], list[
 
 
 @step
-def pdilc(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def pdilc(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of the PD-type learning law, or of the PID in run 0."""
     before = int64(cell.before[0])
     if int64(inputs.iteration) == 0:

@@ -13,12 +13,10 @@ Everything is divided by the mass M: f = u/M. No position feedback: the position
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import Record, int64, step
 from ato_hil.controller.q import clamp, round_shift, sat32
 from ato_hil.controller.quantise import Vehicle, fixed
 
@@ -69,7 +67,7 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
 
 
 @step
-def pid(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def pid(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of the PID baseline."""
     if int64(inputs.tick) == 0:
         state.integral = 0

@@ -16,11 +16,9 @@ by the mass M: f = u/M.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import Record, int64, step
 from ato_hil.controller.laws.drac import (
     TRACK_PARAMS,
     TRACK_STATE,
@@ -91,7 +89,9 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
 
 
 @step
-def pid_feedforward(params: Any, state: Any, cell: Any, inputs: Any, outputs: Any) -> None:
+def pid_feedforward(
+    params: Record, state: Record, cell: Record, inputs: Record, outputs: Record
+) -> None:
     """One tick of the PID baseline."""
     track = state.track
     if int64(inputs.tick) == 0:

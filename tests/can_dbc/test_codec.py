@@ -31,6 +31,7 @@ from ato_hil.can_dbc.codec import (
     mailboxes,
     put,
     saturate,
+    values,
     word_of,
 )
 from ato_hil.can_dbc.step import dbc_path
@@ -209,6 +210,12 @@ def test_value_tables_by_name() -> None:
     assert choices("RUN_CTRL", "RunState") == {"idle": 0, "armed": 1, "running": 2, "ended": 3}
     with pytest.raises(DbcError, match=r"ato\.dbc: FORCE_CMD\.Force has no value table"):
         choices("FORCE_CMD", "Force")
+
+
+def test_values_of_a_table_by_their_names() -> None:
+    assert values("RUN_CTRL", "RunState", "ended idle") == [3, 0]
+    with pytest.raises(DbcError, match=r"ato\.dbc: RUN_CTRL\.RunState has no value gone"):
+        values("RUN_CTRL", "RunState", "idle gone")
 
 
 # A DBC that does not define the interface

@@ -14,7 +14,7 @@ import numpy as np
 
 from ato_hil.can_dbc.step import INTERPRETED, int64
 from ato_hil.controller.firmware import build_tick
-from ato_hil.controller.registry import law_step, load_law
+from ato_hil.controller.registry import load_law
 
 
 def argument(value: Any) -> Any:
@@ -29,7 +29,7 @@ def argument(value: Any) -> Any:
 
 def tick(law: str, *arguments: Any) -> None:
     """The cyclic task around a law."""
-    build_tick(law_step(load_law(law)))(*arguments)
+    build_tick(load_law(law).step)(*arguments)
 
 
 def main() -> None:

@@ -9,7 +9,6 @@ from ato_hil.controller.registry import (
     is_file,
     law_label,
     law_names,
-    law_step,
     load_law,
 )
 
@@ -35,7 +34,7 @@ def written(folder: Path, content: str, name: str = "mine.py") -> Path:
 
 @pytest.mark.parametrize("law", law_names())
 def test_every_law_has_a_step_named_as_its_file(law):
-    assert law_step(load_law(law)).__name__ == law.replace("-", "_")
+    assert load_law(law).step.__name__ == law.replace("-", "_")
     assert law_label(law) == law
     assert not is_file(law)
 
@@ -48,9 +47,9 @@ def test_an_unknown_law_names_those_there_are():
 
 def test_a_law_in_a_file_is_executed_once(tmp_path):
     file = written(tmp_path, LAW)
-    module = load_law(str(file))
-    assert law_step(module).__name__ == "mine"
-    assert load_law(str(file)) is module
+    law = load_law(str(file))
+    assert law.step.__name__ == "mine"
+    assert load_law(str(file)).module is law.module
     assert law_label("some/where/my_law.py") == "my-law"
 
 
@@ -58,8 +57,8 @@ def test_files_of_one_name_are_two_laws(tmp_path):
     (tmp_path / "other").mkdir()
     first = load_law(str(written(tmp_path, LAW)))
     second = load_law(str(written(tmp_path / "other", LAW)))
-    assert first is not second
-    assert second.__file__ == str(tmp_path / "other" / "mine.py")
+    assert first.module is not second.module
+    assert second.module.__file__ == str(tmp_path / "other" / "mine.py")
 
 
 @pytest.mark.parametrize(
@@ -71,6 +70,7 @@ def test_files_of_one_name_are_two_laws(tmp_path):
         ("import no_such_module\n", "{file}:1: ModuleNotFoundError: No module named"),
         (LAW.replace("STATE", "STORE"), "{file}: expected STATE, see the laws in"),
         (LAW.replace("calibrate", "set_up"), "{file}: expected calibrate, see the laws in"),
+        (LAW.replace("WORDS = ", "") + "WORDS = (('u', 'N', 4),)", "{file}: expected learned, see"),
         (LAW.replace("mine", "yours"), "{file}: expected mine, see the laws in"),
     ],
 )
@@ -84,7 +84,7 @@ def test_a_file_that_is_no_law_is_refused_with_one_line(tmp_path, content, expec
     assert "\n" not in str(error.value)
     if content is not None:
         file.write_text(LAW)
-        assert load_law(str(file)).__file__ == str(file), "a mended file is read again"
+        assert load_law(str(file)).module.__file__ == str(file), "a mended file is read again"
 
 
 def test_the_file_of_a_law_is_an_identifier(tmp_path):

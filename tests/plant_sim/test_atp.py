@@ -13,6 +13,7 @@ from ato_hil.can_dbc import e2e
 from ato_hil.can_dbc.codec import FORCE_CMD, put, saturate
 from ato_hil.plant_sim import (
     atp,
+    atp_tables,
     plant,
     track,
     world,
@@ -32,7 +33,7 @@ def brake(*steps, build_up_s=1.0):
 
 def limits_for(settings_of_atp, sections=LEVEL, period_s=0.01, a_1=1.2, a_2=0.1, limit=60.0):
     times = np.array([(2**62, limit)], atp.LIMIT)
-    made = atp.supervised(settings_of_atp, times, sections, period_s, a_1, a_2)
+    made = atp_tables.supervised(settings_of_atp, times, sections, period_s, a_1, a_2)
     return atp.Limits(*map(world.rows, made))
 
 
@@ -234,7 +235,7 @@ def test_the_interventions_lie_their_reaction_times_before_ebd(
 def test_a_warning_that_cuts_traction_leaves_less_time_for_it():
     def traction_s(cut_off_s):
         settings_of_atp = atp.Atp(traction_cut_off_s=cut_off_s, warning_cuts_traction=True)
-        times = atp.times_of(settings_of_atp, 0.01, 1.0, 0.0)
+        times = atp_tables.times_of(settings_of_atp, 0.01, 1.0, 0.0)
         return times.traction, times.berem
 
     assert traction_s(1.0) == (0.0, pytest.approx(1.01))
@@ -287,13 +288,15 @@ def test_the_curves_are_in_order_and_only_a_higher_static_speed_raises_them(spee
 )
 def test_the_least_behind_is_that_of_every_point_under_the_train(values, lengths, train, place):
     from_m = [-math.inf, *np.cumsum(lengths[: len(values) - 1]).astype(float)]
-    result = atp.least_behind(atp.Way(from_m, [float(value) for value in values]), train)
+    result = atp_tables.least_behind(
+        atp_tables.Way(from_m, [float(value) for value in values]), train
+    )
 
     def at(way, x):
         rows = np.maximum(np.searchsorted(way.from_m, x, side="right") - 1, 0)
         return np.array(way.values)[rows]
 
-    way = atp.Way(from_m, values)
+    way = atp_tables.Way(from_m, values)
     expected = at(way, np.linspace(place - train, place, 4001)).min()
     assert at(result, place) <= expected
     beside = [edge for edge in from_m for end in (place, place - train) if abs(edge - end) < 0.1]
@@ -305,7 +308,7 @@ def test_a_gradient_that_changes_counts_as_its_worst_over_a_piece():
     sloped = track.sections(
         track.Track(interpolation="linear", from_m=[100.0, 200.0], resistance_n_per_kn=[0.0, -10.0])
     )
-    way = atp.gradients(sloped, 0.0)
+    way = atp_tables.gradients(sloped, 0.0)
     for position in np.arange(50.0, 250.0, 1.7):
         row = np.searchsorted(way.from_m, position, side="right") - 1
         true = -10.0 * min(max((position - 100.0) / 100.0, 0.0), 1.0) * 9.81e-3
@@ -536,7 +539,7 @@ def test_no_controller_takes_a_train_past_ebd_or_the_supervised_location(
     assert truth["position_m"].max() <= end_m + overlap_m + 1e-6
     # Near a lower static speed traction may still be on when V_target + dV_ebi is exceeded.
     rolling = max(0.0, -9.81e-3 * min(values))
-    delays = atp.times_of(loaded.scenario.atp, PERIOD_S, power + rolling, rolling)
+    delays = atp_tables.times_of(loaded.scenario.atp, PERIOD_S, power + rolling, rolling)
     over = truth["speed_m_s"] - truth["emergency_deceleration_speed_m_s"]
     assert np.nanmax(over, initial=-1.0) < delays.delta_m_s + error_m_s
 

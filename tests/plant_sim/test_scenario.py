@@ -112,7 +112,7 @@ MISTAKES = [
         'base = "crh3-learning"\n[run_length]\nreading = "stretched"\nshortest_s = 1200.0',
         r"\[run_length\]: 120000 ticks are not 2/3 to 2 times the planned 250000",
     ),
-    ('base = "subway"\nrun = 3', r"Object contains unknown field `run`"),
+    ('base = "subway"\nrun = 3', r"Object contains unknown field `run`, did you mean runs\?"),
     ('base = "subway"\nruns = 0', r"key runs: 0, expected 1 or more"),
     (
         'base = "subway"\nlaw = "bang-bang"',

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ato_hil.plant_sim.scenario import Loaded, at_rate, members
-from ato_hil.tools.runs import onboard, summary_row
-from ato_hil.tools.runs.frames import timetable_rate
-from ato_hil.tools.session import sil
+from ato_hil.plant_sim.scenario import Loaded, members
+from ato_hil.tools.runs import onboard
+from ato_hil.tools.session import in_process
 from ato_hil.tools.session.session import prepare
+from ato_hil.tools.trace import facts
 from ato_hil.tools.trace.writer import TraceWriter
 
 
@@ -29,13 +30,14 @@ def compare(
     `trace_file` is touched; SessionError if it cannot be written.
     """
     trains = members(loaded)
-    controllers = {law: onboard.controllers_for(trains, law) for law in laws}
+    for law in laws:  # a wrong one is refused before anything runs
+        onboard.controllers_for(trains, law)
     prepare(trace_file.parent)
     writer = TraceWriter(
         trace_file,
         title=f"{loaded.name}: {', '.join(laws)}",
         period_s=loaded.scenario.period_s,
-        cars=len(loaded.scenario.train.effectiveness) if loaded.scenario.control.distribute else 0,
+        cars=onboard.cars(loaded),
         reference=loaded.profile,
         first_run=1,
         last_run=len(laws),
@@ -47,21 +49,16 @@ def compare(
     try:
         for number, law in enumerate(laws, start=1):
             progress(law)
-            numbers = onboard.run_numbers(law, runs)
-            for results in sil.run_line(loaded, controllers[law], runs=numbers, seed=seed):
-                run = results[0].run
-                if run not in (1, numbers[-1]):
-                    continue
-                row = summary_row.row_of(trains, law, results)
-                faults = sorted({name for result in results for name in result.faults})
-                rows.append({"law": law, "run": run, **row, "faults": faults})
-                if run == numbers[-1]:
-                    rate = timetable_rate(results[0].frames)
-                    if rate:
-                        writer.reference(number, at_rate(loaded, rate).profile)
-                    for train, result in enumerate(results):
-                        writer.frames(number, result.frames, train)
-                        writer.truth(number, result.truth, train)
+            last = onboard.run_numbers(law, runs)[-1]
+            for run in in_process.runs(loaded, law, runs, seed=seed):
+                if run.number in (1, last):
+                    faults = sorted({name for names in run.faults for name in names})
+                    rows.append({"law": law, "run": run.number, **run.metrics, "faults": faults})
+                if run.number == last:
+                    for train, frames in enumerate(run.frames):
+                        writer.frames(number, frames, train)
+                    told = facts.of(run)
+                    facts.apply(replace(told, run=number, truths=told.truths[:1], row=None), writer)
     finally:
         writer.close()
     return rows

@@ -40,10 +40,10 @@ from ato_hil.controller.interface import FAULTS, fault_names
 from ato_hil.plant_sim.scenario import load
 from ato_hil.tools.campaigns.detection import READ
 from ato_hil.tools.runs import onboard
-from ato_hil.tools.runs.result import RunResult
-from ato_hil.tools.session import processes, sil
+from ato_hil.tools.runs.result import Run
+from ato_hil.tools.session import in_process, processes
 from ato_hil.tools.session.external_nodes import PLANT
-from ato_hil.tools.session.session import RUNS_MAX
+from ato_hil.tools.session.options import RUNS_MAX
 
 BURST = WIRE_FRAMES - 8  # frames in a tick: what 500 kbit/s have room for beside the run's own
 RECEIVE_TIMEOUT_S = 0.1
@@ -183,7 +183,7 @@ def beside(
     loaded = load(scenario)
     calibration = onboard.calibration_for(loaded, law)
     runs = range(1, RUNS_MAX + 1)  # it ends when the noise does
-    quiet = sil.run(loaded, calibration, runs=runs, seed=seed)
+    quiet = in_process.runs(loaded, law, numbers=runs, seed=seed)
     name = choose_bus(bus).name
     noise = [
         "ato_hil.tools.campaigns.random_frames",
@@ -213,13 +213,13 @@ def beside(
             for node, event, bench in events:
                 if node.name == PLANT and event["event"] == "run":
                     (truth,) = np.load(event["file"])
-                    result, _ = next(quiet)
+                    silent = next(quiet)
                     done, ticks = done + 1, ticks + len(truth)
-                    reported = event["faults"][0] & ~_faults_of(result)
+                    reported = event["faults"][0] & ~_faults_of(silent)
                     if reported:
                         stopped, faults = stopped + 1, faults | reported
                     else:
-                        changed += differing_rows(truth, result.truth)
+                        changed += differing_rows(truth, silent.truths[0])
                     progress(f"run {event['run']} with noise")
                     kinds = bench.nodes["noise"].said.get("done", {}).get("kinds", {})
                     if kinds:
@@ -232,9 +232,9 @@ def beside(
     return Outcome(sent, sorted_kinds, done, ticks, changed, stopped, names, expected)
 
 
-def _faults_of(result: RunResult) -> int:
+def _faults_of(run: Run) -> int:
     """The fault bits of a run without noise."""
-    return sum(bit for bit, name in FAULTS.items() if name in result.faults)
+    return sum(bit for bit, name in FAULTS.items() if name in run.faults[0])
 
 
 if __name__ == "__main__":

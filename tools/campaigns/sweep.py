@@ -27,12 +27,11 @@ from ato_hil.controller.registry import law_label
 from ato_hil.plant_sim.scenario import (
     Loaded,
     load,
-    members,
     overlaid,
 )
-from ato_hil.tools.runs import onboard, summary_row
+from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.files import write_text
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 
 CASE = "case"  # the key that varies the scenario's named case
 LAW = "law."  # short for laws.<the law>.
@@ -145,24 +144,18 @@ def _compile(points: list[Point]) -> None:
         what = (point.law, type(loaded.scenario.train))
         if what not in seen:
             seen.add(what)
-            nodes = onboard.controllers_for(members(loaded), point.law)
-            for _results in sil.run_line(loaded, nodes, runs=range(0), seed=point.seed):
+            for _run in in_process.runs(loaded, point.law, numbers=range(0)):
                 pass
 
 
 def measure(point: Point) -> dict[str, Any]:
     """The row of one point: its values, and the metrics of its last run, of a line the worst."""
     loaded = overlaid(point.scenario, point.overlay)
-    trains = members(loaded)
-    nodes = onboard.controllers_for(trains, point.law)
-    numbers = onboard.run_numbers(point.law, point.runs)
-    row: dict[str, Any] = {}
-    for results in sil.run_line(loaded, nodes, runs=numbers, seed=point.seed):
-        if results[0].run == numbers[-1]:
-            row = {"run": numbers[-1], **summary_row.row_of(trains, point.law, results)}
-            faults = (name for result in results for name in result.faults)
-            row["faults"] = ", ".join(dict.fromkeys(faults))
+    *_, last = in_process.runs(loaded, point.law, point.runs, seed=point.seed)
+    row = {"run": last.number, **last.metrics}
     row.pop("trains", None)
+    faults = (name for names in last.faults for name in names)
+    row["faults"] = ", ".join(dict.fromkeys(faults))
     return {**{key: _plain(value) for key, value in point.values.items()}, **row}
 
 

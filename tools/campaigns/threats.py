@@ -72,10 +72,10 @@ from ato_hil.plant_sim.scenario import Loaded, load
 from ato_hil.tools.campaigns.detection import READ, Evidence
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.files import write_json, write_text
-from ato_hil.tools.runs.frames import LineDigest
-from ato_hil.tools.runs.result import RunResult
+from ato_hil.tools.runs.result import Run
 from ato_hil.tools.session import session
-from ato_hil.tools.session.sil_faults import run_line
+from ato_hil.tools.session.in_process import runs as runs_in_process
+from ato_hil.tools.session.options import Silent
 
 SCENARIO = """\
 # A hop between two stops, for `ato-hil threats`.
@@ -196,20 +196,14 @@ def run(
     return campaign
 
 
-class _Progress:
+class _Progress(Silent):
     """Watches the session on the bus."""
 
     def __init__(self, progress: Callable[[str], None]) -> None:
         self._progress = progress
 
-    def begin(self, loaded: Loaded, law: str, runs: range) -> None: ...
-
-    def note(self, text: str) -> None: ...
-
     def progress(self, run: int, tick: int) -> None:
         self._progress(f"on the bus: run {run}")
-
-    def row(self, row: dict[str, Any]) -> None: ...
 
 
 def threats() -> list[Threat]:
@@ -311,52 +305,49 @@ def in_process(
     loaded: Loaded, listed: list[Numbered], plan: Plan, progress: Callable[[str], None]
 ) -> tuple[Campaign, list[Event]]:
     """All runs in one process: the campaign with a row for each threat, and all injected faults."""
-    nodes = onboard.controllers_for([loaded], loaded.scenario.law)
-    bounds = reaction_ticks(nodes[0].params[0]["guard"])
+    calibration = onboard.calibration_for(loaded, loaded.scenario.law)
+    bounds = reaction_ticks(calibration.params[0]["guard"])
     command_age_max = loaded.scenario.atp.command_age_max_ticks
     evidence = Evidence(loaded.scenario.period_s)
-    digest = LineDigest(1)
     by_run = {run: each for each in listed for run in each.runs}
     found = {each.threat.name: Row(each.threat.name, problems=[]) for each in listed}
     reactions: dict[str, list[int]] = {name: [] for name in found}
     events: list[Event] = []
     all_runs = range(1, listed[-1].runs.stop)
-    for (result,) in run_line(
-        loaded, nodes, runs=all_runs, seed=plan.seed, plan=plan, watch=evidence
-    ):
-        each = by_run[result.run]
+    for run in runs_in_process(loaded, numbers=all_runs, seed=plan.seed, plan=plan, watch=evidence):
+        each = by_run[run.number]
+        truth = run.truths[0]
         row = found[each.threat.name]
-        digest.update([result.frames])
-        events += result.injected
+        events += run.injected
         row.runs += 1
-        row.frames += len(result.frames)
-        margin = result.truth["emergency_brake_speed_m_s"] - result.truth["speed_m_s"]
+        row.frames += len(run.frames[0])
+        margin = truth["emergency_brake_speed_m_s"] - truth["speed_m_s"]
         row.margin_m_s = min(row.margin_m_s, float(margin.min()))
-        if result.cut:
-            row.problems.append(result.cut)
-        noticed = _judge(row, each, result, evidence)
+        if run.cut:
+            row.problems.append(run.cut)
+        noticed = _judge(row, each, run, evidence)
         if each.threat.stays:
-            _judge_reaction(row, each.threat, result, evidence, reactions[row.threat])
+            _judge_reaction(row, each.threat, run, evidence, reactions[row.threat])
             row.bound = bounds.get(each.threat.fault, command_age_max + 1)
         else:
             row.bound = NOTICE_TICKS
             reactions[row.threat] += noticed
-        progress(f"run {result.run} of {all_runs[-1]}")
+        progress(f"run {run.number} of {all_runs[-1]}")
     for each in listed:
         _conclude(found[each.threat.name], each.threat, reactions[each.threat.name])
     rows = list(found.values())
     problems = [f"{row.threat}: {problem}" for row in rows for problem in row.problems]
     total = sum(row.frames for row in rows)
-    return Campaign("sil", plan.seed, total, digest.hex(), rows, problems), events
+    return Campaign("sil", plan.seed, total, run.digest, rows, problems), events
 
 
-def _judge(row: Row, each: Numbered, result: RunResult, evidence: Evidence) -> list[int]:
+def _judge(row: Row, each: Numbered, run: Run, evidence: Evidence) -> list[int]:
     """Fault by fault until the guard brakes: noticed, or with an effect. The ticks until the notice
     of those that are noticed."""
     noticed = []
     late = set()  # message and number of frames whose delay was noticed
-    end = evidence.braked.get(result.run, len(result.truth)) if each.threat.stays else np.inf
-    for event in result.injected:
+    end = evidence.braked.get(run.number, run.ticks) if each.threat.stays else np.inf
+    for event in run.injected:
         rule = each.threat.rules[event.rule - each.first_rule]
         message = rule.id if isinstance(rule, Insert) else event.message
         if message not in NODE_OF or event.tick > end:
@@ -381,15 +372,15 @@ def _judge(row: Row, each: Numbered, result: RunResult, evidence: Evidence) -> l
 
 
 def _judge_reaction(
-    row: Row, threat: Threat, result: RunResult, evidence: Evidence, reactions: list[int]
+    row: Row, threat: Threat, run: Run, evidence: Evidence, reactions: list[int]
 ) -> None:
     """Of a fault that comes to stay: when the train is braked, and that it stops."""
-    braked = evidence.braked.get(result.run)
+    braked = evidence.braked.get(run.number)
     if braked is not None:
-        reactions.append(braked - result.injected[0].tick)
+        reactions.append(braked - run.injected[0].tick)
     elif threat.visible:
         row.problems.append("nobody braked")
-    speed_m_s = float(result.truth["speed_m_s"][-1])
+    speed_m_s = float(run.truths[0]["speed_m_s"][-1])
     if threat.visible and abs(speed_m_s) > STOPPED_M_S:
         row.problems.append(f"at the end the train runs at {speed_m_s:.2f} m/s")
 

@@ -6,13 +6,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
-from ato_hil.tools.cli.console import EXIT_BAD_INPUT, EXIT_ENDED_EARLY, fail, one_line_for_bad_input
+from ato_hil.tools.cli.console import (
+    EXIT_BAD_INPUT,
+    EXIT_ENDED_EARLY,
+    fail,
+    one_line_for_bad_input,
+    say,
+    working,
+)
 from ato_hil.tools.cli.options import Channel, LawName, Recording, ScenarioName
-from ato_hil.tools.cli.output import coloured, console
+from ato_hil.tools.cli.output import console
+from ato_hil.tools.cli.tables import Column, Row, show
 
 if TYPE_CHECKING:
+    from ato_hil.tools.bench.bench import Figure
     from ato_hil.tools.reports.bus_report import Report as BusReport
 
 
@@ -36,20 +44,17 @@ def replay(
         from ato_hil.tools.session import replay as open_loop
 
         prepared = open_loop.prepare(recording, scenario, law, memory, channel)
-        console.print(
+        say(
             f"{prepared.loaded.name}, {law_label(prepared.calibration.law)}:"
             f" {len(prepared.runs)} runs",
-            soft_wrap=True,
         )
         for note in prepared.notes:
-            console.print(note, style="dim", soft_wrap=True)
+            say(note, "dim")
         for result in open_loop.replay(prepared):
             if result.difference is not None:
                 where = f"run {result.run}, tick {result.difference.tick}"
                 raise fail(f"{recording}: {where}: {result.difference.text}", EXIT_BAD_INPUT)
-            console.print(
-                f"run {result.run}: {result.ticks} ticks, {result.commands} commands as recorded"
-            )
+            say(f"run {result.run}: {result.ticks} ticks, {result.commands} commands as recorded")
         if prepared.missing:
             raise fail(f"{recording}: {'; '.join(prepared.missing)}", EXIT_ENDED_EARLY)
 
@@ -63,13 +68,16 @@ def decode(
     with one_line_for_bad_input():
         from ato_hil.tools.runs import decode as tables
 
-        done = tables.decode(recording, out, channel)
-    console.print(f"{out}: {done.rows} frames, {len(done.messages)} messages", soft_wrap=True)
-    notes = list(done.notes)
+        with working(f"reading {recording} ...") as update:
+            done = tables.decode(
+                *(recording, out, channel),
+                lambda rows, of: update(f"{rows:,} of {of:,} frames written"),
+            )
+    say(f"{out}: {done.rows} frames, {len(done.messages)} messages")
     if done.unknown:
-        notes.insert(0, f"{done.unknown} frames that the DBC does not have are left out")
-    for note in notes:
-        console.print(note, style="dim", soft_wrap=True)
+        say(f"{done.unknown} frames that the DBC does not have are left out", "dim")
+    for note in done.notes:
+        say(note, "dim")
     if done.missing:
         raise fail(f"{recording}: {done.missing}", EXIT_ENDED_EARLY)
 
@@ -93,7 +101,7 @@ def bus_report(
         loaded = load(scenario)
         name = law or loaded.scenario.law
         load_law(name)
-        with console.status("finding out what is sent ..."):
+        with working("finding out what is sent ..."):
             found = report(loaded, name, bitrate)
     if as_json:
         console.out(json.dumps(found.as_json(), indent=1), highlight=False)
@@ -104,29 +112,32 @@ def bus_report(
 
 
 def _print_bus_report(found: BusReport) -> None:
-    headings = ("id", "message", "bytes", "frames\na tick", "cycle\nms", "frame\nbits", "load\n%")
-    table = Table(*headings, "response\nms", "deadline\nms", "margin\nms", header_style="bold")
-    for column in table.columns:
-        column.justify = "right"
-    table.columns[1].justify = "left"
-    for row in found.rows:
-        table.add_row(
-            f"{row.frame_id:#05x}",
-            row.message,
-            f"{row.data_bytes}",
-            f"{row.frames_per_tick:.2f}",
-            f"{row.cycle_ms:g}",
-            f"{row.frame_bits}",
-            f"{100 * row.load:.2f}",
-            "no bound" if row.response_ms is None else f"{row.response_ms:.3f}",
-            f"{row.cycle_ms:g}",
-            "-" if row.margin_ms is None else f"{row.margin_ms:.3f}",
-            style=None if row.meets_deadline else "red",
+    rows = [
+        Row(
+            (
+                f"{row.frame_id:#05x}",
+                row.message,
+                f"{row.data_bytes}",
+                f"{row.frames_per_tick:.2f}",
+                f"{row.cycle_ms:g}",
+                f"{row.frame_bits}",
+                f"{100 * row.load:.2f}",
+                "no bound" if row.response_ms is None else f"{row.response_ms:.3f}",
+                f"{row.cycle_ms:g}",
+                "-" if row.margin_ms is None else f"{row.margin_ms:.3f}",
+            ),
+            "" if row.meets_deadline else "red",
         )
-    table.add_section()
+        for row in found.rows
+    ]
     load = f"{100 * found.load:.2f}"
-    table.add_row("", "all", "", f"{found.frames_per_tick:.2f}", "", "", load, "", "", "")
-    console.print(table)
+    rows.append(Row(("", "all", "", f"{found.frames_per_tick:.2f}", "", "", load, "", "", "")))
+    numbers = ("frames\na tick", "cycle\nms", "frame\nbits", "load\n%", "response\nms")
+    columns = [
+        *(Column("id"), Column("message", text=True), Column("bytes", spare=True)),
+        *map(Column, (*numbers, "deadline\nms", "margin\nms")),
+    ]
+    show(console, columns, rows, f"{found.bitrate} bit/s")
 
 
 def bench(
@@ -140,38 +151,41 @@ def bench(
     from ato_hil.tools.bench import bench as rates
     from ato_hil.tools.bench import pingpong
 
+    say("what is measured has the machine to itself: this takes minutes", "dim")
     buses = bus or ["hub:bench"]
     with one_line_for_bad_input():
         if sessions:
-            table = Table("what", "ticks/s", "peer", "peer's ticks/s", "ratio", header_style="bold")
-            for figure in rates.measure(buses[0]):
-                table.add_row(
-                    figure.what,
-                    f"{figure.ticks_per_s:,.0f}",
-                    figure.peer,
-                    f"{figure.peer_ticks_per_s:,.0f}",
-                    f"{figure.ratio:.2f}",
-                )
-            console.print(table)
-        table = Table(
-            *("ping-pong", "round trip p50 µs", "p99 µs", "frames/s"),
-            *("p50 : C", "p99 : C", "frames/s : C"),
-            header_style="bold",
-        )
-        for name in buses:
-            figures = pingpong.measure(name)
-            for pair in figures:
-                table.add_row(*_ping_pong(pair, figures[0]))
-        console.print(table)
+            rows = []
+            with working("SIL ...") as update:
+                for figure in rates.measure(buses[0]):
+                    rows.append(Row(_session(figure)))
+                    update(f"last: {figure.what}, {figure.ticks_per_s:,.0f} ticks/s")
+            words, numbers = Column("what", text=True), Column("ticks/s")
+            peer = (Column("peer", text=True), Column("peer's ticks/s"), Column("ratio"))
+            show(console, [words, numbers, *peer], rows)
+        names = ("round trip p50\nµs", "p99\nµs", "frames/s", "p50 : C", "p99 : C", "frames/s : C")
+        rows = []
+        with working("") as update:
+            for name in buses:
+                update(f"ping-pong on {name} ...")
+                figures = pingpong.measure(name)
+                rows += [Row(_ping_pong(pair, figures[0])) for pair in figures]
+        show(console, [Column("ping-pong", text=True), *map(Column, names)], rows)
 
 
-def _ping_pong(figure: Any, peer: Any) -> list[str]:
+def _session(figure: Figure) -> tuple[str, ...]:
+    rate, ratio = figure.peer_ticks_per_s, figure.ratio
+    cells = ("-", "-") if rate is None or ratio is None else (f"{rate:,.0f}", f"{ratio:.2f}")
+    return (figure.what, f"{figure.ticks_per_s:,.0f}", figure.peer, *cells)
+
+
+def _ping_pong(figure: Any, peer: Any) -> tuple[str, ...]:
     cells = (figure.median_us, figure.slowest_us, figure.frames_per_s)
-    row = [figure.what, *(f"{cell:,.0f}" for cell in cells)]
+    ratios = ["-", "-", "-"]
     if peer.what.startswith("C"):
         peers = (peer.median_us, peer.slowest_us, peer.frames_per_s)
-        row += [f"{mine / its:.2f}" for mine, its in zip(cells, peers, strict=True)]
-    return row
+        ratios = [f"{mine / its:.2f}" for mine, its in zip(cells, peers, strict=True)]
+    return (figure.what, *(f"{cell:,.0f}" for cell in cells), *ratios)
 
 
 def doctor() -> None:
@@ -179,10 +193,9 @@ def doctor() -> None:
     from ato_hil.tools.cli import doctor as checks
 
     findings = checks.examine()
-    table = Table("what", "state", "how it was checked, and what to do", header_style="bold")
-    for finding in findings:
-        colour = {"works": "green", "absent": "yellow", "broken": "red"}[finding.state]
-        table.add_row(finding.what, coloured(finding.state, colour), finding.text)
-    console.print(table)
+    colours = {"works": "", "absent": "yellow", "broken": "red"}
+    rows = [Row((each.what, each.state, each.text), colours[each.state]) for each in findings]
+    names = ("what", "state", "how it was checked, and what to do")
+    show(console, [Column(name, text=True) for name in names], rows)
     if any(finding.state == "broken" for finding in findings):
         raise typer.Exit(EXIT_BAD_INPUT)

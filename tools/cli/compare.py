@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
-from ato_hil.tools.cli.columns import COMPARED, SWEPT, cell, faults_of
-from ato_hil.tools.cli.console import EXIT_INTERRUPTED, fail, one_line_for_bad_input
-from ato_hil.tools.cli.options import LawName, Runs, ScenarioName, Seed
+from ato_hil.tools.cli import places
+from ato_hil.tools.cli.columns import COMPARED, SWEPT, cell, faults_of, headings
+from ato_hil.tools.cli.console import (
+    EXIT_INTERRUPTED,
+    fail,
+    one_line_for_bad_input,
+    say,
+    say_if_compiling,
+    working,
+)
+from ato_hil.tools.cli.options import LawName, Overwrite, Runs, ScenarioName, Seed
 from ato_hil.tools.cli.output import console
+from ato_hil.tools.cli.tables import Column, Row, show
+
+if TYPE_CHECKING:
+    from ato_hil.plant_sim.scenario import Loaded
+    from ato_hil.tools.campaigns.sweep import Point
 
 
 def compare(
@@ -22,9 +34,11 @@ def compare(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of trace.rrd and compare.json; runs/SCENARIO-compare by default."
+            help="Folder of trace.rrd and compare.json; by default a new one,"
+            " runs/SCENARIO-compare."
         ),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Run several laws on one scenario (SIL): one table, and one trace with their last runs
     overlaid."""
@@ -34,30 +48,32 @@ def compare(
         from ato_hil.tools.runs import files
 
         loaded = load(scenario)
-        folder = out or Path("runs") / f"{loaded.folder_name}-compare"
         names = [law.strip() for law in laws.split(",") if law.strip()]
-        with console.status("") as status:
+        say_if_compiling()
+        with (
+            places.folder(out, f"{loaded.folder_name}-compare", overwrite) as place,
+            working("compiling, where it is the first time") as update,
+        ):
             rows = side_by_side.compare(
                 loaded,
                 names,
                 runs or loaded.scenario.runs,
                 seed,
-                folder / "trace.rrd",
-                lambda law: status.update(f"{law} ..."),
+                place.work / "trace.rrd",
+                lambda law: update(f"{law} ..."),
             )
-        files.write_json(
-            folder / "compare.json", {"schema": 1, "scenario": loaded.name, "rows": rows}
-        )
-    table = Table("law", *(name for name, key, _f, _s in COMPARED), "faults", header_style="bold")
-    for row in rows:
-        table.add_row(
-            row["law"], *(cell(row, key, f, s) for _n, key, f, s in COMPARED), faults_of(row)
-        )
-    console.print(table)
+            content = {"schema": 1, "scenario": loaded.name, "rows": rows}
+            files.write_json(place.work / "compare.json", content)
+    columns = [Column("law", text=True), *headings(COMPARED), Column("faults", text=True)]
+    lines = [
+        Row((row["law"], *(cell(row, key, f, s) for _n, key, f, s in COMPARED), faults_of(row)))
+        for row in rows
+    ]
+    show(console, columns, lines)
     for name in names:
         if name in loaded.scenario.tuning:
-            console.print(f"gains of {name}: {loaded.scenario.tuning[name]}", soft_wrap=True)
-    console.print(f"trace   {folder / 'trace.rrd'}", soft_wrap=True)
+            say(f"gains of {name}: {loaded.scenario.tuning[name]}")
+    say(f"trace   {place.final / 'trace.rrd'}")
 
 
 def sweep(
@@ -75,38 +91,57 @@ def sweep(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of sweep.csv, sweep.json, pareto.png and pareto.svg;"
-            " runs/SCENARIO-sweep by default."
+            help="Folder of sweep.csv, sweep.json, pareto.png and pareto.svg; by default a new one,"
+            " runs/SCENARIO-sweep."
         ),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Vary numbers of a scenario, side by side on all cores (SIL): a table, and energy against
     error."""
-    try:
-        with one_line_for_bad_input():
-            _sweep(scenario, vary, law, runs, seed, out)
-    except KeyboardInterrupt:
-        raise fail("interrupted; nothing was written", EXIT_INTERRUPTED) from None
-
-
-def _sweep(
-    scenario: str, vary: list[str], law: str | None, runs: int | None, seed: int, out: Path | None
-) -> None:
     from ato_hil.plant_sim.scenario import load
     from ato_hil.tools.campaigns import sweep as side_by_side
-    from ato_hil.tools.runs import files
-    from ato_hil.tools.session import session
 
-    points = side_by_side.plan(scenario, law, vary, runs, seed)
-    loaded = load(scenario)
-    folder = out or Path("runs") / f"{loaded.folder_name}-sweep"
-    session.prepare(folder)
+    try:
+        with one_line_for_bad_input():
+            points = side_by_side.plan(scenario, law, vary, runs, seed)
+            loaded = load(scenario)
+            with places.folder(out, f"{loaded.folder_name}-sweep", overwrite) as place:
+                rows = _sweep(points, loaded, place.work)
+    except KeyboardInterrupt:
+        raise fail("interrupted; nothing was written", EXIT_INTERRUPTED) from None
+    keys = list(points[0].values)
+    front = set(side_by_side.pareto(rows))
+    columns = [*map(Column, keys), *headings(SWEPT)]
+    lines = [
+        Row(
+            (
+                *(str(row[key]) for key in keys),
+                *(cell(row, key, f, s) for _n, key, f, s in SWEPT),
+                "*" if index in front else "",
+                row["faults"],
+            )
+        )
+        for index, row in enumerate(rows)
+    ]
+    show(console, [*columns, Column("front"), Column("faults", text=True)], lines)
+    say("* no other combination has less energy and less position error")
+    say(f"table   {place.final / 'sweep.csv'}, sweep.json")
+    say(f"plot    {place.final / 'pareto.png'}, pareto.svg")
+
+
+def _sweep(points: list[Point], loaded: Loaded, folder: Path) -> list[dict[str, Any]]:
+    """The rows, after they were written."""
+    from ato_hil.tools.campaigns import sweep as side_by_side
+    from ato_hil.tools.runs import files
+
+    say_if_compiling()
     keys = list(points[0].values)
     done: dict[int, dict[str, Any]] = {}
-    with console.status(f"{len(points)} combinations: compiling") as status:
+    with working(f"{len(points)} combinations: compiling") as update:
         for index, row in side_by_side.sweep(points):
             done[index] = row
-            status.update(f"{len(done)} of {len(points)} combinations")
+            update(f"{len(done)} of {len(points)} combinations")
     rows = [done[index] for index in range(len(points))]
     side_by_side.write_table(folder / "sweep.csv", rows)
     files.write_json(
@@ -115,16 +150,4 @@ def _sweep(
     )
     for suffix in ("png", "svg"):
         side_by_side.plot(folder / f"pareto.{suffix}", loaded, rows, keys)
-    front = set(side_by_side.pareto(rows))
-    table = Table(*keys, *(name for name, *_rest in SWEPT), "front", "faults", header_style="bold")
-    for index, row in enumerate(rows):
-        table.add_row(
-            *(str(row[key]) for key in keys),
-            *(cell(row, key, f, s) for _n, key, f, s in SWEPT),
-            "*" if index in front else "",
-            row["faults"],
-        )
-    console.print(table)
-    console.print("* no other combination has less energy and less position error")
-    console.print(f"table   {folder / 'sweep.csv'}, sweep.json", soft_wrap=True)
-    console.print(f"plot    {folder / 'pareto.png'}, pareto.svg", soft_wrap=True)
+    return rows

@@ -3,33 +3,59 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import typer
+from rich.text import Text
 
 from ato_hil.can_dbc.errors import InputError
-from ato_hil.tools.cli.output import errors
+from ato_hil.tools.cli.output import console, errors
 
 EXIT_BAD_INPUT = 1
 EXIT_ENDED_EARLY = 3  # a session, or a recording
+EXIT_NOT_AS_EXPECTED = 4
 EXIT_INTERRUPTED = 130
+
+
+def say(text: str, style: str = "") -> None:
+    """One line of output, whatever its length. It may hold what comes from a user: a name with
+    brackets or colons is no markup."""
+    console.print(Text(text, style), soft_wrap=True)
+
+
+def say_if_compiling() -> None:
+    """The first run compiles, and nothing is to be seen of that for a while."""
+    from ato_hil.can_dbc.step import INTERPRETED, cache_directory
+
+    folder = cache_directory()
+    if not INTERPRETED and (folder is None or not folder.is_dir()):
+        say("the steps are compiled now, once: about half a minute", "dim")
+
+
+@contextmanager
+def working(text: str) -> Iterator[Callable[[str], None]]:
+    """Shows on a terminal what is under way; what is yielded changes the text."""
+    with console.status(Text(text)) as status:
+        yield lambda new: status.update(Text(new))
 
 
 def fail(message: str, code: int) -> typer.Exit:
     """Says why on one line; what it returns, raised, ends the command with that exit status."""
-    errors.print(f"ato-hil: {message}", style="red", soft_wrap=True)
+    errors.print(Text(f"ato-hil: {message}", "red"), soft_wrap=True)
     return typer.Exit(code)
 
 
 @contextmanager
 def one_line_for_bad_input() -> Iterator[None]:
-    """Bad input of every kind is one line and an exit status, no traceback; so is a step that the
-    compiler refuses."""
+    """Bad input of every kind is one line and an exit status, no traceback; so are a step that the
+    compiler refuses, and Ctrl-C where the command does not say more."""
     try:
         yield
     except InputError as error:
         raise fail(str(error), EXIT_BAD_INPUT) from None
+    except KeyboardInterrupt:
+        raise fail("interrupted", EXIT_INTERRUPTED) from None
     except Exception as error:
         if type(error).__module__ != "numba.core.errors":
             raise

@@ -14,16 +14,22 @@ import json
 import math
 import sys
 import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from cantools.database.can import Message, Signal
-from typer.models import ArgumentInfo, CommandInfo, ParameterInfo
+from typer.main import get_command
 
 from ato_hil.can_dbc.codec import database
-from ato_hil.tools.cli.main import app
+from ato_hil.tools.cli.console import (
+    EXIT_BAD_INPUT,
+    EXIT_ENDED_EARLY,
+    EXIT_INTERRUPTED,
+    EXIT_NOT_AS_EXPECTED,
+)
+from ato_hil.tools.cli.main import COMMANDS, app
 from ato_hil.tools.runs.files import write_text
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs"
@@ -39,8 +45,24 @@ and the handshake are in [bring-your-own-node.md](bring-your-own-node.md).
 COMMANDS_HEAD = """# Command line
 
 Every command of `ato-hil`; this page is made from the program (`make docs`), and
-`ato-hil COMMAND --help` says the same. Bad input gives one line and exit status 1; a run or
-a recording that ends early gives 3, Ctrl-C 130.
+`ato-hil COMMAND --help` says the same. `ato-hil --version` says which one it is.
+"""
+EXIT_STATUS = f"""Exit status:
+
+| | |
+| --- | --- |
+| 0 | done, and everything that was checked is right |
+| {EXIT_BAD_INPUT} | bad input, on one line that says what was expected; or a check failed |
+| 2 | a command, option or value that the command line does not have |
+| {EXIT_ENDED_EARLY} | a run ended early: a node or the bus is gone; the runs before it are kept |
+| {EXIT_NOT_AS_EXPECTED} | `run --expect`: the last run is otherwise |
+| {EXIT_INTERRUPTED} | Ctrl-C or SIGTERM; what was finished is kept |
+
+Results are never replaced without a word. Without `--out` a session gets a folder of its own:
+`runs/subway-cailc-hil`, the next time `runs/subway-cailc-hil-2`. A folder or recording that has
+results is refused unless `--overwrite` is given; they, and the figures and the report made from
+them, stay until the new ones are finished, and for good if those are interrupted: what there is of
+them is in `unfinished` in the same folder, of a recording in `unfinished-NAME` beside it.
 """
 CLAIMS_BEGIN, CLAIMS_END = "<!-- claims: from ato-hil claims -->\n", "<!-- end of claims -->\n"
 
@@ -102,66 +124,70 @@ def _plain(text: str | None) -> str:
 
 
 def command_line() -> str:
-    """docs/command-line.md."""
-    parts = [COMMANDS_HEAD, *(_command(info) for info in app.registered_commands)]
+    """docs/command-line.md, from the parameters that the parser itself has."""
+    groups = []
+    for panel, commands in COMMANDS.items():
+        links = [f"[{name}](#{name.replace(' ', '-')})" for name, _function in commands]
+        groups.append(f"- {panel}: {', '.join(links)}")
+    parts = [COMMANDS_HEAD, "\n".join(groups), EXIT_STATUS]
+    parts += [
+        _command(name, function, _parser(name).params)
+        for commands in COMMANDS.values()
+        for name, function in commands
+    ]
     return "\n\n".join(part.strip("\n") for part in parts) + "\n"
 
 
-def _command(info: CommandInfo) -> str:
-    assert info.callback is not None
-    name = info.name or info.callback.__name__.replace("_", "-")
-    parameters = list(_parameters(info.callback))
-    usage = [f"ato-hil {name}", *(shown for shown, place, *_ in parameters if place)]
-    usage += ["[OPTIONS]"] if any(not place for _, place, *_ in parameters) else []
-    lines = [f"## {name}", "", f"    {' '.join(usage)}", "", _sentence(info.callback), ""]
+def _parser(name: str) -> Any:
+    """The command of one or two words."""
+    found: Any = get_command(app)
+    for word in name.split():
+        found = found.commands[word]
+    return found
+
+
+def _command(name: str, function: Callable[..., None], parameters: Sequence[Any]) -> str:
+    kinds = get_type_hints(function)
+    arguments = [each for each in parameters if each.param_type_name == "argument"]
+    options = [each for each in parameters if each.param_type_name == "option"]
+    usage = [f"ato-hil {name}", *map(_argument, arguments), *(["[OPTIONS]"] if options else [])]
+    lines = [f"## {name}", "", f"    {' '.join(usage)}", "", _sentence(function), ""]
     if parameters:
         lines += ["| | default | |", "| --- | --- | --- |"]
-        lines += [f"| `{shown}` | {default} | {text} |" for shown, _, default, text in parameters]
+    for each in arguments + options:
+        shown = _argument(each) if each in arguments else _option(each, kinds[each.name])
+        default = "needed" if each.required else _default(each.default)
+        help_text = (each.help or "").replace("|", "\\|")
+        lines.append(f"| `{shown}` | {default} | {help_text} |")
     return "\n".join(lines)
 
 
-def _sentence(callback: Any) -> str:
-    return " ".join((inspect.getdoc(callback) or "").split())
+def _sentence(function: Callable[..., None]) -> str:
+    return " ".join((inspect.getdoc(function) or "").split())
 
 
-def _parameters(callback: Any) -> Iterator[tuple[str, bool, str, str]]:
-    """(how it is written, whether by its place, default, meaning) of each parameter."""
-    hints = get_type_hints(callback, include_extras=True)
-    for name, parameter in inspect.signature(callback).parameters.items():
-        kind, info = (
-            get_args(hints[name])[:2] if get_origin(hints[name]) is Annotated else (None, None)
-        )
-        assert isinstance(info, ParameterInfo), f"{callback.__name__}: {name} is not annotated"
-        by_place = isinstance(info, ArgumentInfo)
-        needed = parameter.default is inspect.Parameter.empty
-        shown = _written(name, kind, info)
-        if by_place and not needed:
-            shown = f"[{shown}]"
-        default = "needed" if needed else _default(parameter.default)
-        yield shown, by_place, default, (info.help or "").replace("|", "\\|")
+def _argument(parameter: Any) -> str:
+    several = "..." if parameter.nargs == -1 else ""
+    shown: str = parameter.metavar or f"{parameter.name.upper()}{several}"
+    return shown if parameter.required else f"[{shown}]"
 
 
-def _written(name: str, kind: Any, info: ParameterInfo) -> str:
-    base, several = _base(kind)
-    if isinstance(info, ArgumentInfo):
-        return info.metavar or name.upper() + ("..." if several else "")
-    option = next(iter(info.param_decls or ()), f"--{name.replace('_', '-')}")
-    if base is bool:
-        explicit = bool(info.param_decls)
-        return option if explicit else f"{option}/--no-{name.replace('_', '-')}"
+def _option(parameter: Any, kind: Any) -> str:
+    name = "/".join((*parameter.opts, *parameter.secondary_opts))
+    if parameter.is_flag:
+        return name
+    base = _base(kind)
     if isinstance(base, type) and issubclass(base, Enum):
-        return f"{option} {{{','.join(str(member.value) for member in base)}}}"
+        return f"{name} {{{','.join(str(member.value) for member in base)}}}"
     values = {int: "N", float: "X", Path: "PATH"}
-    return f"{option} {info.metavar or values.get(base, 'TEXT')}"
+    return f"{name} {parameter.metavar or values.get(base, 'TEXT')}"
 
 
-def _base(kind: Any) -> tuple[Any, bool]:
-    """The type of one value, and whether there may be several."""
+def _base(kind: Any) -> Any:
+    """The type of one value."""
     if get_origin(kind) in (Union, types.UnionType):
         kind = next(each for each in get_args(kind) if each is not type(None))
-    if get_origin(kind) is list:
-        return get_args(kind)[0], True
-    return kind, False
+    return get_args(kind)[0] if get_origin(kind) is list else kind
 
 
 def _default(value: Any) -> str:

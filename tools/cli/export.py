@@ -7,9 +7,8 @@ from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli.console import one_line_for_bad_input
+from ato_hil.tools.cli.console import one_line_for_bad_input, say
 from ato_hil.tools.cli.options import DEFAULT_BOARD, BoardName
-from ato_hil.tools.cli.output import console
 from ato_hil.tools.session import boards
 
 app = typer.Typer(help="The firmware for other tools and targets.", no_args_is_help=True)
@@ -20,7 +19,6 @@ def group() -> None:
     """The firmware for other tools and targets."""
 
 
-@app.command("c")
 def c_command(
     scenario: Annotated[
         str, typer.Argument(help="Name of a scenario (`ato-hil list`) or a .toml file.")
@@ -39,12 +37,9 @@ def c_command(
         made = folder.files(scenario, law)
         folder.write(made, out)
     lines = sum(text.count("\n") for text in made.values())
-    console.print(
-        f"{out}: {len(made)} files, {lines} lines; the manual is {out / 'ato.h'}", soft_wrap=True
-    )
+    say(f"{out}: {len(made)} files, {lines} lines; the manual is {out / 'ato.h'}")
 
 
-@app.command("image")
 def image_command(
     scenario: Annotated[
         str, typer.Argument(help="Name of a scenario (`ato-hil list`) or a .toml file.")
@@ -61,4 +56,4 @@ def image_command(
         from ato_hil.tools.export import image
 
         image.build(load(scenario), law, boards.board_of(board.value), out)
-    console.print(f"{out}: {boards.BOARDS[board.value].about}", soft_wrap=True)
+    say(f"{out}: {boards.BOARDS[board.value].about}")

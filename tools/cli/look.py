@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
+from rich.text import Text
 
+from ato_hil.tools.cli import outline
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     fail,
     one_line_for_bad_input,
+    say,
     sigterm_as_ctrl_c,
 )
 from ato_hil.tools.cli.options import Picture, ScenarioName
@@ -20,20 +22,26 @@ from ato_hil.tools.cli.output import console
 
 def list_scenarios() -> None:
     """List the scenarios and the laws that each has gains for."""
-    from ato_hil.plant_sim.scenario import ScenarioError, case_names, load
+    rows = [
+        (name, " ".join(each.laws), f"{each.title}{_cases(each)}")
+        for name, each in outline.packaged().items()
+    ]
+    headings = ("scenario", "laws (default first)", "what it is; cases: `run SCENARIO:CASE`")
+    names, laws, _what = (max(map(len, column)) for column in zip(headings, *rows, strict=True))
+    lines = [f"{name:<{names}}  {of_it:<{laws}}  {what}" for name, of_it, what in (headings, *rows)]
+    if console.is_terminal and max(map(len, lines)) > console.width:
+        lines = [f"{name:<{names}}  {what}" for name, _laws, what in (headings, *rows)]
+    for line in lines:
+        console.print(
+            Text(line),
+            soft_wrap=not console.is_terminal,
+            no_wrap=True,
+            overflow="ellipsis",
+        )
 
-    table = Table("scenario", "laws (default first)", "run", "what it is", header_style="bold")
-    try:
-        for name in case_names():
-            loaded = load(name)
-            default = loaded.scenario.law
-            others = sorted(set(loaded.scenario.laws) - {default})
-            duration_s = loaded.ticks * loaded.scenario.period_s
-            length = f"{loaded.profile.position_m[-1]:.0f} m, {duration_s:.0f} s"
-            table.add_row(name, " ".join([default, *others]), length, loaded.scenario.title)
-    except ScenarioError as error:
-        raise fail(str(error), EXIT_BAD_INPUT) from None
-    console.print(table)
+
+def _cases(outlined: outline.Outline) -> str:
+    return f"; cases {' '.join(outlined.cases)}" if outlined.cases else ""
 
 
 def profile(
@@ -93,12 +101,12 @@ def view(
         with finished.prepared(recorded, law_compare) as trace:
             if screenshot is not None:
                 finished.screenshot(trace, screenshot, tab)
-                console.print(f"picture {screenshot}", soft_wrap=True)
+                say(f"picture {screenshot}")
                 return
             kind = live_viewer.WEB if web else live_viewer.NATIVE
             live_viewer.check(kind)
             process, text = live_viewer.show(kind, [str(trace.resolve())])
-            console.print(text, soft_wrap=True)
+            say(text)
             try:
                 status = process.wait()
             except KeyboardInterrupt:
@@ -131,13 +139,13 @@ def figures(
     with one_line_for_bad_input():
         for drawn in draw.figures([read(folder) for folder in folders]):
             if drawn.figure is None:
-                console.print(f"{drawn.stem}: not drawn: {drawn.why_not}", soft_wrap=True)
+                say(f"{drawn.stem}: not drawn: {drawn.why_not}")
                 continue
             files += draw.write(drawn, target, kinds)
-            console.print(f"{drawn.stem}: {drawn.drawing.caption}", soft_wrap=True)
+            say(f"{drawn.stem}: {drawn.drawing.caption}")
     if not files:
         raise fail("nothing could be drawn", EXIT_BAD_INPUT)
-    console.print(f"{len(files)} files in {target}", soft_wrap=True)
+    say(f"{len(files)} files in {target}")
 
 
 def report(
@@ -150,4 +158,4 @@ def report(
     target = out or folder / "report.html"
     with one_line_for_bad_input():
         page.write(folder, target)
-    console.print(f"report  {target}", soft_wrap=True)
+    say(f"report  {target}")

@@ -1,41 +1,78 @@
-"""The command line `ato-hil`: its commands, in the order in which they are listed."""
+"""The command line `ato-hil`: its commands by group, in the order of `--help` and the docs."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import sys
+from collections.abc import Callable
+from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli import buses, compare, export, look, prove, run
+from ato_hil.tools.cli import buses, clean, compare, export, look, prove, run
 from ato_hil.tools.cli.options import Viewer
 from ato_hil.tools.cli.output import ignore_other_tools, streams
 
 app = typer.Typer(
     name="ato-hil",
-    help="Train control laws as fixed-point firmware, hardware-in-the-loop on a virtual CAN bus.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
 
-app.command()(run.run)
-app.command()(look.view)
-app.command()(buses.replay)
-app.command()(buses.decode)
-app.command("list")(look.list_scenarios)
-app.command()(look.profile)
-app.command()(buses.doctor)
-app.command()(compare.compare)
-app.command()(compare.sweep)
-app.command()(prove.claims)
-app.command()(look.figures)
-app.command()(look.report)
-app.command("bus-report")(buses.bus_report)
-app.command()(buses.bench)
-app.command()(prove.threats)
-app.command()(prove.noise)
-app.command()(prove.verify)
-app.command()(prove.endurance)
-app.add_typer(export.app, name="export")
+COMMANDS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
+    "Run and look": (
+        ("run", run.run),
+        ("view", look.view),
+        ("figures", look.figures),
+        ("report", look.report),
+        ("list", look.list_scenarios),
+        ("doctor", buses.doctor),
+        ("clean", clean.clean),
+    ),
+    "Compare": (
+        ("compare", compare.compare),
+        ("sweep", compare.sweep),
+    ),
+    "Prove": (
+        ("claims", prove.claims),
+        ("verify", prove.verify),
+        ("threats", prove.threats),
+        ("noise", prove.noise),
+        ("endurance", prove.endurance),
+        ("bench", buses.bench),
+    ),
+    "Buses and recordings": (
+        ("replay", buses.replay),
+        ("decode", buses.decode),
+        ("profile", look.profile),
+        ("bus-report", buses.bus_report),
+    ),
+    "Take away": (("export c", export.c_command), ("export image", export.image_command)),
+}
+GROUPS = {"": app, "export": export.app}  # of commands of two words
+
+for _panel, _commands in COMMANDS.items():
+    for _name, _command in _commands:
+        _help = " ".join((_command.__doc__ or "").split())  # without the line ends of the source
+        _group, _, _last = _name.rpartition(" ")
+        GROUPS[_group].command(_last, rich_help_panel=_panel, help=_help)(_command)
+app.add_typer(export.app, name="export", rich_help_panel="Take away")
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"ato-hil {importlib.metadata.version('ato-hil')}")
+        raise typer.Exit
+
+
+@app.callback()
+def every_command(
+    version: Annotated[
+        bool,
+        typer.Option("--version", is_eager=True, callback=_version, help="Say which one this is."),
+    ] = False,
+) -> None:
+    """Train control laws as fixed-point firmware, hardware-in-the-loop on a virtual CAN bus."""
 
 
 def main() -> None:

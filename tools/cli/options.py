@@ -59,6 +59,12 @@ ScenarioName = Annotated[
 LawName = Annotated[str | None, typer.Option(help="Control law; the scenario's by default.")]
 Runs = Annotated[int | None, typer.Option(min=1, help="Runs in a row; the scenario's by default.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of noise and disturbance.")]
+Overwrite = Annotated[
+    bool,
+    typer.Option(
+        "--overwrite", help="Replace the results that are there, once the new ones are finished."
+    ),
+]
 Recording = Annotated[
     Path,
     typer.Argument(

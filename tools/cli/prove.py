@@ -7,23 +7,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
+from ato_hil.can_dbc.errors import expected
+from ato_hil.tools.cli import places
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     EXIT_ENDED_EARLY,
     EXIT_INTERRUPTED,
     fail,
     one_line_for_bad_input,
+    say,
     sigterm_as_ctrl_c,
+    working,
 )
-from ato_hil.tools.cli.options import Mode
-from ato_hil.tools.cli.output import coloured, console
+from ato_hil.tools.cli.options import Mode, Overwrite
+from ato_hil.tools.cli.output import console
+from ato_hil.tools.cli.tables import Column, Row, show
 
 if TYPE_CHECKING:
+    from ato_hil.tools.campaigns.endurance import Outcome
     from ato_hil.tools.campaigns.threats import Campaign
     from ato_hil.tools.campaigns.undetected import Rate
-    from ato_hil.tools.verify import Row
+    from ato_hil.tools.verify import Row as Check
 
 RESIDUAL_FRAMES = 10_000_000  # random corruptions, for the rate of those that are not seen
 
@@ -35,30 +40,39 @@ def claims(
     ] = None,
 ) -> None:
     """Measure a paper's claims through the product, row by row."""
+    import pkgutil
+
     from ato_hil.tools import papers
     from ato_hil.tools.papers.claims import evaluate
     from ato_hil.tools.runs import files
 
-    known = papers.names()
+    known = sorted(module.name for module in pkgutil.iter_modules(papers.__path__) if module.ispkg)
     if paper not in known:
-        raise fail(f"no claims of {paper!r}, expected one of {', '.join(known)}", EXIT_BAD_INPUT)
+        raise fail(f"no claims of {paper!r}, {expected(paper, known)}", EXIT_BAD_INPUT)
     if json_file is not None and not json_file.absolute().parent.is_dir():
         raise fail(f"{json_file}: no such folder", EXIT_BAD_INPUT)
-    table = Table("claim", "paper", "threshold", "measured", "holds", header_style="bold")
+    claimed = papers.part(paper, "claims").CLAIMS
+    say(f"{len(claimed)} claims, measured on whole runs: this takes minutes", "dim")
     rows = []
-    for claim in papers.part(paper, "claims").CLAIMS:
-        row = evaluate(claim)
-        rows.append(row)
-        colour = "green" if row.holds == row.expected else "red"
-        verdict = ("yes" if row.holds else "no") + ("" if row.expected else " (as found)")
-        table.add_row(
-            row.text,
-            row.paper,
-            f"{row.threshold} {row.unit}".strip(),
-            f"{row.measured:.4g} {row.unit}".strip(),
-            coloured(verdict, colour),
+    with one_line_for_bad_input(), working("") as update:
+        for number, claim in enumerate(claimed, start=1):
+            update(f"{number} of {len(claimed)}: {claim.text}")
+            rows.append(evaluate(claim))
+    lines = [
+        Row(
+            (
+                row.text,
+                row.paper,
+                f"{row.threshold} {row.unit}".strip(),
+                f"{row.measured:.4g} {row.unit}".strip(),
+                ("yes" if row.holds else "no") + ("" if row.expected else " (as found)"),
+            ),
+            "" if row.holds == row.expected else "red",
         )
-    console.print(table)
+        for row in rows
+    ]
+    names = ("claim", "paper", "threshold", "measured", "holds")
+    show(console, [Column(name, text=True) for name in names], lines)
     if json_file is not None:
         content = {"schema": 1, "paper": paper, "claims": [row.as_json() for row in rows]}
         files.write_json(json_file, content)
@@ -82,15 +96,17 @@ def verify(
     with one_line_for_bad_input():
         if renew_golden:
             for line in identity.renew(laws or law_names()):
-                console.print(line, soft_wrap=True)
+                say(line)
             return
-        with console.status("verifying") as status:
+        if not fast:
+            say("every check of every law that is asked for: this takes minutes", "dim")
+        with working("verifying") as update:
             for row in table.run(laws or [], fast):
                 rows.append(row)
                 if not console.is_terminal:
                     line = f"{row.state}: {row.name}, {row.subject}; {row.how}: {row.result}"
-                    console.print(line, soft_wrap=True)
-                status.update(f"{len(rows)} checks; last: {row.name}, {row.subject}")
+                    say(line)
+                update(f"{len(rows)} checks; last: {row.name}, {row.subject}")
     if console.is_terminal:
         _print_rows(rows)
     if rows[-1].state == "failed":
@@ -98,13 +114,14 @@ def verify(
         raise fail(f"{last.name} of {last.subject} failed: {last.result}", EXIT_BAD_INPUT)
 
 
-def _print_rows(rows: list[Row]) -> None:
-    shown = Table("property", "of", "how it was checked", "result", "", header_style="bold")
-    for row in rows:
-        colour = {"passed": "green", "absent": "yellow", "failed": "red"}[row.state]
-        state = coloured(row.state, colour)
-        shown.add_row(row.name, row.subject, row.how, row.result, state)
-    console.print(shown)
+def _print_rows(rows: list[Check]) -> None:
+    colours = {"passed": "", "absent": "yellow", "failed": "red"}
+    lines = [
+        Row((row.name, row.subject, row.how, row.result, row.state), colours[row.state])
+        for row in rows
+    ]
+    names = ("property", "of", "how it was checked", "result", "")
+    show(console, [Column(name, text=True) for name in names], lines)
 
 
 def threats(
@@ -116,8 +133,13 @@ def threats(
     bus: Annotated[str, typer.Option(help="Of mode hil, as for `run`.")] = "auto",
     seed: Annotated[int, typer.Option(min=0, help="Of the faults.")] = 1,
     out: Annotated[
-        Path, typer.Option(help="Folder of threats.json, its scenario and its faults.")
-    ] = Path("runs/threats"),
+        Path | None,
+        typer.Option(
+            help="Folder of threats.json, its scenario and its faults; by default a new one,"
+            " runs/threats."
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Attack a run with every threat of EN 50159, and say what was noticed, how soon, and what
     came of it."""
@@ -128,62 +150,65 @@ def threats(
     if mode not in (Mode.sil, Mode.hil):
         raise fail(f"threats: mode is {mode.value}, expected sil or hil", EXIT_BAD_INPUT)
     least = frames or (1_000_000 if mode is Mode.sil else 100_000)
+    say(
+        f"{least:,} frames or more, and {RESIDUAL_FRAMES:,} corrupt ones: this takes minutes", "dim"
+    )
     try:
         with (
             one_line_for_bad_input(),
             sigterm_as_ctrl_c(),
-            console.status("compiling ...") as status,
+            places.folder(out, "threats", overwrite) as place,
+            working("compiling ...") as update,
         ):
             rates = undetected.measure(RESIDUAL_FRAMES, seed)
-            found = campaign.run(least, mode.value, bus, seed, out, status.update)
+            found = campaign.run(least, mode.value, bus, seed, place.work, update)
     except RunError as error:
         raise fail(str(error), EXIT_ENDED_EARLY) from None
-    except KeyboardInterrupt:
-        raise fail("interrupted", EXIT_INTERRUPTED) from None
     _print_threats(found)
     _print_residual(rates)
+    say(f"threats {place.final / 'threats.json'}")
     problems = found.problems + [f"{r.corruption}: not as computed" for r in rates if not r.agrees]
     if problems:
         raise fail("; ".join(problems), EXIT_BAD_INPUT)
 
 
 def _print_threats(found: Campaign) -> None:
-    headings = ("injected", "noticed", "not, no\neffect", "not, force\nchanged")
-    reaction = ("reaction\np50", "ticks\nmax", "bound", "to the EBI\nm/s")
-    table = Table("threat", "runs", "frames", *headings, *reaction, header_style="bold")
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for row in found.rows:
-        table.add_row(
-            row.threat,
-            *(f"{n:,}" for n in (row.runs, row.frames, row.injected, row.noticed)),
-            *(f"{n:,}" for n in (row.harmless, row.with_effect)),
-            *("-" if n is None else f"{n:g}" for n in (row.reaction_p50, row.reaction_max)),
-            "none" if row.bound is None else f"{row.bound}",
-            f"{row.margin_m_s:.2f}",
-            style="red" if row.problems else None,
+    counts = ("runs", "frames", "injected", "noticed", "not, no\neffect", "not, force\nchanged")
+    reaction = ("reaction p50\nticks", "reaction max\nticks", "bound\nticks", "to the EBI\nm/s")
+    rows = [
+        Row(
+            (
+                row.threat,
+                *(f"{n:,}" for n in (row.runs, row.frames, row.injected, row.noticed)),
+                *(f"{n:,}" for n in (row.harmless, row.with_effect)),
+                *("-" if n is None else f"{n:g}" for n in (row.reaction_p50, row.reaction_max)),
+                "none" if row.bound is None else f"{row.bound}",
+                f"{row.margin_m_s:.2f}",
+            ),
+            "red" if row.problems else "",
         )
-    console.print(table)
+        for row in found.rows
+    ]
+    show(console, [Column("threat", text=True), *map(Column, counts + reaction)], rows)
     text = f"{found.frames:,} frames, {found.mode}, seed {found.seed}, digest {found.digest}"
-    console.print(text, soft_wrap=True)
+    say(text)
 
 
 def _print_residual(rates: list[Rate]) -> None:
-    table = Table("corruption", "frames", "taken for good", "share", header_style="bold")
-    table.add_column("computed")
-    table.add_column("99.99 % interval")
+    rows = []
     for rate in rates:
         exact = rate.low == rate.high
-        table.add_row(
+        cells = (
             rate.corruption,
             f"{rate.frames:,}",
             f"{rate.passed:,}",
             f"{rate.passed / rate.frames:.3g}",
             "all tried" if exact else f"{rate.computed:.4g}",
             "-" if exact else f"{rate.low:.4g} .. {rate.high:.4g}",
-            style=None if rate.agrees else "red",
         )
-    console.print(table)
+        rows.append(Row(cells, "" if rate.agrees else "red"))
+    numbers = ("frames", "taken for good", "share", "computed", "99.99 % interval")
+    show(console, [Column("corruption", text=True), *map(Column, numbers)], rows)
 
 
 def noise(
@@ -204,28 +229,29 @@ def noise(
     from ato_hil.tools.campaigns import random_mailboxes
     from ato_hil.tools.session.processes import RunError
 
+    say(f"{frames:,} random frames beside runs: this takes minutes", "dim")
     try:
         with (
             one_line_for_bad_input(),
             sigterm_as_ctrl_c(),
-            console.status("compiling ...") as status,
+            working("compiling ...") as update,
         ):
-            found = flood.beside(scenario, law, frames, seed, bus, status.update)
-            status.update("random words ...")
+            found = flood.beside(scenario, law, frames, seed, bus, update)
+            update("random words ...")
             direct = random_mailboxes.run(scenario, words, seed)
     except RunError as error:
         raise fail(str(error), EXIT_ENDED_EARLY) from None
-    except KeyboardInterrupt:
-        raise fail("interrupted", EXIT_INTERRUPTED) from None
     kinds = ", ".join(f"{count:,} {kind}" for kind, count in found.kinds.items())
-    console.print(f"random frames sent   {found.frames:,} ({kinds})", soft_wrap=True)
-    console.print(f"beside               {found.runs} runs, {found.ticks:,} ticks")
-    console.print(f"ticks changed        {found.changed}")
-    console.print(f"runs with a fault    {found.stopped} ({', '.join(found.faults) or 'none'})")
-    console.print(f"expected to be taken {found.expected_taken:.2g} frames")
-    console.print(f"random words         {direct.words:,}, half of them protected")
-    console.print(f"largest force        {direct.largest_command:.3f} commanded,", end=" ")
-    console.print(f"{direct.largest_traction:.3f} of traction, of what the train can give")
+    say(f"random frames sent   {found.frames:,} ({kinds})")
+    say(f"beside               {found.runs} runs, {found.ticks:,} ticks")
+    say(f"ticks changed        {found.changed}")
+    say(f"runs with a fault    {found.stopped} ({', '.join(found.faults) or 'none'})")
+    say(f"expected to be taken {found.expected_taken:.2g} frames")
+    say(f"random words         {direct.words:,}, half of them protected")
+    say(
+        f"largest force        {direct.largest_command:.3f} commanded,"
+        f" {direct.largest_traction:.3f} of traction, of what the train can give"
+    )
     problems = []
     if found.frames < frames:
         problems.append(f"{found.frames} random frames were sent, expected {frames}")
@@ -241,30 +267,46 @@ def endurance(
     times: Annotated[int, typer.Option(min=1, help="Sessions.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Seed of victims and moments.")] = 1,
     out: Annotated[
-        Path, typer.Option(help="Folder of endurance.json, and of the trials that failed.")
-    ] = Path("runs/endurance"),
+        Path | None,
+        typer.Option(
+            help="Folder of endurance.json, and of the trials that failed; by default a new one,"
+            " runs/endurance."
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Kill and stop nodes of sessions at random moments: each has to end named and clean."""
     from ato_hil.tools.campaigns import endurance as trials
     from ato_hil.tools.runs import files
 
-    done = []
+    say(f"{times} sessions, some seconds each", "dim")
+    done: list[Outcome] = []
     with (
         one_line_for_bad_input(),
         sigterm_as_ctrl_c(),
-        console.status("") as status,
-        suppress(KeyboardInterrupt),  # what was done counts
+        places.folder(out, "endurance", overwrite) as place,
     ):
-        for outcome in trials.campaign(trials.plan(times, seed), out):
-            done.append(outcome)
-            status.update(f"{len(done)} of {times} sessions; last: {outcome.cause}")
-            for complaint in outcome.complaints:
-                text = f"trial {outcome.trial.number}: {complaint} ({outcome.cause})"
-                console.print(text, style="red", soft_wrap=True)
-            rows = [each.as_json() for each in done]
-            files.write_json(out / "endurance.json", {"schema": 1, "seed": seed, "trials": rows})
-    headings = ("node", "signal", "sessions", "named and clean", "longest to the end, s")
-    table = Table(*headings, header_style="bold")
+        with working("") as update, suppress(KeyboardInterrupt):  # what was done counts
+            for outcome in trials.campaign(trials.plan(times, seed), place.work):
+                done.append(outcome)
+                update(f"{len(done)} of {times} sessions; last: {outcome.cause}")
+                for complaint in outcome.complaints:
+                    text = f"trial {outcome.trial.number}: {complaint} ({outcome.cause})"
+                    say(text, "red")
+                rows = [each.as_json() for each in done]
+                content = {"schema": 1, "seed": seed, "trials": rows}
+                files.write_json(place.work / "endurance.json", content)
+        _print_outcomes(done)
+        if len(done) < times:
+            text = f"interrupted after {len(done)} of {times} sessions; they are in {place.work}"
+            raise fail(text, EXIT_INTERRUPTED)
+    failed = sum(bool(each.complaints) for each in done)
+    if failed:
+        raise fail(f"{failed} of {len(done)} sessions did not end as demanded", EXIT_BAD_INPUT)
+
+
+def _print_outcomes(done: list[Outcome]) -> None:
+    lines = []
     kinds = dict.fromkeys((each.trial.victim, each.trial.signal) for each in done)
     for victim, number in kinds:
         of_kind = [
@@ -272,10 +314,7 @@ def endurance(
         ]
         clean = sum(not each.complaints for each in of_kind)
         longest = max(each.seconds for each in of_kind)
-        table.add_row(victim, number.name, f"{len(of_kind)}", f"{clean}", f"{longest:.1f}")
-    console.print(table)
-    failed = sum(bool(each.complaints) for each in done)
-    if failed:
-        raise fail(f"{failed} of {len(done)} sessions did not end as demanded", EXIT_BAD_INPUT)
-    if len(done) < times:
-        raise fail(f"interrupted after {len(done)} of {times} sessions", EXIT_INTERRUPTED)
+        lines.append(Row((victim, number.name, f"{len(of_kind)}", f"{clean}", f"{longest:.1f}")))
+    numbers = ("sessions", "named and clean", "longest to the end\ns")
+    words = (Column("node", text=True), Column("signal", text=True))
+    show(console, [*words, *map(Column, numbers)], lines)

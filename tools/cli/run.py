@@ -2,38 +2,43 @@
 
 from __future__ import annotations
 
-import os
-import sys
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
-from ato_hil.can_dbc.child import python
-from ato_hil.tools.cli.columns import cell, columns_of, faults_of, shown_rows
+from ato_hil.tools.cli import places
+from ato_hil.tools.cli.columns import cell, columns_of, faults_of, headings, shown_rows
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     EXIT_ENDED_EARLY,
     EXIT_INTERRUPTED,
+    EXIT_NOT_AS_EXPECTED,
     fail,
     one_line_for_bad_input,
+    say,
+    say_if_compiling,
     sigterm_as_ctrl_c,
 )
+from ato_hil.tools.cli.expect import Expectation, check_keys, parse, unmet
 from ato_hil.tools.cli.options import (
     DEFAULT_BOARD,
     BoardName,
     External,
     LawName,
     Mode,
+    Overwrite,
     Pace,
     Runs,
     Seed,
     Viewer,
 )
 from ato_hil.tools.cli.output import console
+from ato_hil.tools.cli.tables import Column, Row, show
 from ato_hil.tools.session import boards
 from ato_hil.tools.trace.live_viewer import LiveView
 
@@ -41,23 +46,34 @@ if TYPE_CHECKING:
     from ato_hil.plant_sim.scenario import Loaded
     from ato_hil.tools.session.session import Options
 
+# What a control period of a train takes, at most: measured over subway, crh3, crh3-learning.
+BYTES_OF_TRACE, BYTES_OF_RECORDING = 640, 320
+LARGE_BYTES = 1e9  # said before it is written
+STARTING = "loading or compiling the steps"
+
 
 class Screen:
     """Progress bar and table of a session; a plain line a run where there is no terminal."""
 
-    def __init__(self, mode: Mode) -> None:
+    def __init__(
+        self, mode: Mode, expected: Sequence[Expectation] = (), bytes_per_tick: int = 0
+    ) -> None:
         self.mode = mode
+        self.expected = list(expected)
+        self.bytes_per_tick = bytes_per_tick  # that a train leaves on the disk
         self.rows: list[dict[str, Any]] = []
         self.title = ""
         self.faults = 0
-        self.bar = Progress(
-            TextColumn("run {task.fields[run]} of {task.fields[last_run]}", markup=False),
-            BarColumn(),
-            TextColumn(
-                "{task.percentage:>3.0f} %  {task.fields[rate]} ticks/s  {task.fields[last]}",
-                markup=False,
-            ),
+        columns = [
+            TextColumn("run {task.fields[run]} of {task.fields[last_run]}"),
+            TextColumn("{task.percentage:>3.0f} %"),
             TimeElapsedColumn(),
+            TextColumn("{task.fields[rate]} ticks/s"),
+            TextColumn("{task.fields[last]}", markup=False),
+            BarColumn(),
+        ]
+        self.bar = Progress(
+            *columns[: 3 + (console.width >= 60) + 2 * (console.width >= 100)],
             console=console,
             transient=True,
             disable=not console.is_terminal,
@@ -67,18 +83,27 @@ class Screen:
         """Says what will be run."""
         self.runs, self.ticks = runs, loaded.ticks
         self.title = f"{loaded.name}, {law}, {self.mode.value}"
-        console.print(
+        say(
             f"{loaded.scenario.title}: law {law}, {len(runs)} runs of {loaded.ticks} ticks,"
             f" {self.mode.value}",
-            soft_wrap=True,
         )
+        size = len(runs) * loaded.ticks * loaded.trains * self.bytes_per_tick
+        if size > LARGE_BYTES:
+            text = f"this will write about {size / 1e9:.1f} GB; --no-trace leaves the trace out"
+            say(text, "yellow")
+        say_if_compiling()
         self.task = self.bar.add_task(
-            "run", total=len(runs) * loaded.ticks, run=runs[0], last_run=runs[-1], rate="-", last=""
+            "run",
+            total=len(runs) * loaded.ticks,
+            run=runs[0],
+            last_run=runs[-1],
+            rate="-",
+            last=STARTING,
         )
 
     def note(self, text: str) -> None:
         """One line above the bar."""
-        self.bar.console.print(text, style="dim", soft_wrap=True)
+        say(text, "dim")
 
     def progress(self, run: int, tick: int) -> None:
         """Moves the bar."""
@@ -86,9 +111,14 @@ class Screen:
         speed = self.bar.tasks[0].speed
         rate = f"{speed:,.0f}" if speed else "-"
         self.bar.update(self.task, completed=done, run=run, rate=rate)
+        if tick and not self.rows:
+            self.bar.update(self.task, last="")
 
     def row(self, row: dict[str, Any]) -> None:
-        """Keeps a run's row and shows its errors beside the bar."""
+        """Keeps a run's row and shows its errors beside the bar. Raises ExpectError where it can
+        never be as expected."""
+        if not self.rows:
+            check_keys(self.expected, row)
         self.rows.append(row)
         self.faults += len(row["faults"])
         last = f"last: {row['max_position_error_m'] * 1e3:.2f} mm, {self.faults} faults"
@@ -101,21 +131,19 @@ class Screen:
                     f"{name.split(chr(10))[0]} {cell(shown, key, f, s)}"
                     for name, key, f, s in columns_of(row)
                 ]
-                console.print("  ".join([*cells, faults_of(shown)]).rstrip(), soft_wrap=True)
+                say("  ".join([*cells, faults_of(shown)]).rstrip())
 
 
 def _print_table(screen: Screen) -> None:
     if not screen.rows or not console.is_terminal:
         return
-    table = Table(title=screen.title, title_justify="left", header_style="bold")
     columns = columns_of(screen.rows[0])
-    for name, _key, _factor, _text in columns:
-        table.add_column(name, justify="right")
-    table.add_column("faults")
-    for row in screen.rows:
-        for shown in shown_rows(row):
-            table.add_row(*(cell(shown, key, f, s) for _n, key, f, s in columns), faults_of(shown))
-    console.print(table)
+    rows = [
+        Row((*(cell(shown, key, f, s) for _n, key, f, s in columns), faults_of(shown)))
+        for row in screen.rows
+        for shown in shown_rows(row)
+    ]
+    show(console, [*headings(columns), Column("faults", text=True)], rows, screen.title)
 
 
 def run(
@@ -153,7 +181,18 @@ def run(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of trace.rrd and summary.json; runs/SCENARIO-LAW-MODE by default."
+            help="Folder of trace.rrd and summary.json; by default a new one,"
+            " runs/SCENARIO-LAW-MODE."
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+    expect: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TEXT",
+            help='Of the last run, such as "max_position_error_m < 0.02": a number of'
+            " summary.json, or how many entries (faults == 0); may be given several times. Exit"
+            " status 4 if it is otherwise.",
         ),
     ] = None,
     memory: Annotated[
@@ -190,14 +229,10 @@ def run(
     ] = None,
 ) -> None:
     """Run a scenario: the train follows its profile, run by run."""
-    if mode is Mode.mil and os.environ.get("ATO_HIL_INTERPRETED") != "1":
-        # The choice is made when the steps are imported, so in a process that has not imported
-        # them.
-        environment = {**os.environ, "ATO_HIL_INTERPRETED": "1"}
-        os.execve(sys.executable, python("-m", "ato_hil", *sys.argv[1:]), environment)
     with one_line_for_bad_input(), sigterm_as_ctrl_c(), ExitStack() as stack:
         from ato_hil.tools.session.session import Options
 
+        expected = [parse(text) for text in expect or ()]
         nodes = tuple(dict.fromkeys(node.value for node in external or ()))
         viewer = None
         if view is not None:
@@ -211,18 +246,21 @@ def run(
             firmware = stack.enter_context(
                 image.built(load(scenario), law, boards.board_of(board.value))
             )
-        _run(
-            Options(
+        with (
+            places.folder(out, _name(scenario, law, mode, nodes), overwrite) as place,
+            places.recording(record, overwrite) as recorded,
+        ):
+            options = Options(
                 scenario=scenario,
                 law=law,
                 runs=runs,
                 mode=mode.value,
                 bus=bus,
                 seed=seed,
-                out=out or _folder(scenario, law, mode, nodes),
+                out=place.work,
                 memory=memory,
                 trace=trace,
-                record=record,
+                record=recorded,
                 external=nodes,
                 faults=faults,
                 pace=pace.value,
@@ -230,13 +268,19 @@ def run(
                 viewer=viewer,
                 firmware=firmware,
                 board=board.value,
-            ),
-            Screen(mode),
-        )
+            )
+            size = BYTES_OF_TRACE * trace + BYTES_OF_RECORDING * (record is not None)
+            summary = _run(options, Screen(mode, expected, size))
+        _print_end(summary, replace(options, out=place.final, record=record))
+        otherwise = unmet(expected, summary["runs"][-1])
+        failure = fail("; ".join(otherwise), EXIT_NOT_AS_EXPECTED) if otherwise else None
+        _wait_for(viewer)
+        if failure is not None:
+            raise failure
 
 
-def _folder(scenario: str, law: str | None, mode: Mode, external: tuple[str, ...]) -> Path:
-    """Where a session leaves its files if nobody says."""
+def _name(scenario: str, law: str | None, mode: Mode, external: tuple[str, ...]) -> str:
+    """Of the folder of a session, if nobody says."""
     from ato_hil.controller.registry import law_label
     from ato_hil.plant_sim.scenario import load
     from ato_hil.tools.session.session import EXTERNAL_LAW
@@ -246,50 +290,54 @@ def _folder(scenario: str, law: str | None, mode: Mode, external: tuple[str, ...
         name = EXTERNAL_LAW
     else:
         name = law_label(law or loaded.scenario.law)
-    return Path("runs") / f"{loaded.folder_name}-{name}-{mode.value}"
+    return f"{loaded.folder_name}-{name}-{mode.value}"
 
 
-def _run(options: Options, screen: Screen) -> None:
+def _run(options: Options, screen: Screen) -> dict[str, Any]:
+    """The summary of the session, after its table."""
     from ato_hil.tools.session import session
     from ato_hil.tools.session.processes import RunError
 
-    folder = options.out
     try:
         with screen.bar:
             summary = session.run(options, screen)
     except RunError as error:
         _print_table(screen)
-        failure = fail(f"{error}; the runs so far are in {folder}", EXIT_ENDED_EARLY)
+        failure = fail(f"{error}; the runs so far are in {options.out}", EXIT_ENDED_EARLY)
         _wait_for(options.viewer)
         raise failure from None
     except KeyboardInterrupt:
         _print_table(screen)
-        raise fail(f"interrupted; the runs so far are in {folder}", EXIT_INTERRUPTED) from None
+        text = f"interrupted; the runs so far are in {options.out}"
+        raise fail(text, EXIT_INTERRUPTED) from None
     _print_table(screen)
+    return summary
+
+
+def _print_end(summary: dict[str, Any], options: Options) -> None:
+    """What a session came to, and where it is."""
+    folder = options.out
     if External.plant in options.external:
-        console.print("errors and energy are what the bus shows: measured, commanded")
+        say("errors and energy are what the bus shows: measured, commanded")
     if "target" in summary:
         _print_target(summary["target"])
     if "timing" in summary:
         _print_timing(summary["timing"])
     repeats = "" if summary["digest_repeats"] else "   (in real time another one each time)"
-    console.print(f"digest  {summary['digest']}{repeats}")
-    console.print(f"summary {folder / 'summary.json'}", soft_wrap=True)
+    say(f"digest  {summary['digest']}{repeats}")
+    say(f"summary {folder / 'summary.json'}")
     if options.trace:
         trace_file = folder / "trace.rrd"
         cost = summary["trace"]
         size = f"{cost['bytes'] / 1e6:.1f} MB, {cost['us_per_frame']:.2f} µs a frame"
-        console.print(f"trace   {trace_file}   {size}", soft_wrap=True)
-        console.print(f"        (open it with: ato-hil view {folder})", soft_wrap=True)
+        say(f"trace   {trace_file}   {size}")
+        say(f"        (open it with: ato-hil view {folder})")
     if options.faults is not None:
         injected = ", ".join(f"{n} {kind}" for kind, n in summary["faults_injected"].items())
         log = folder / "faults.csv"
-        console.print(f"faults  {log}   (injected: {injected or 'none'})", soft_wrap=True)
+        say(f"faults  {log}   (injected: {injected or 'none'})")
     if options.record is not None:
-        console.print(
-            f"record  {options.record}   (again: ato-hil replay {options.record})", soft_wrap=True
-        )
-    _wait_for(options.viewer)
+        say(f"record  {options.record}   (again: ato-hil replay {options.record})")
 
 
 def _wait_for(viewer: LiveView | None) -> None:
@@ -300,20 +348,16 @@ def _wait_for(viewer: LiveView | None) -> None:
 
 
 def _print_target(target: dict[str, Any]) -> None:
-    console.print(
+    say(
         f"board   {target['board']}, code for {target['core']}; a control period takes at most"
-        f" {target['instructions_most']} instructions, the stack {target['stack_bytes']} bytes",
-        soft_wrap=True,
+        f" {target['instructions_most']} instructions, the stack {target['stack_bytes']} bytes"
     )
 
 
 def _print_timing(timing: dict[str, Any]) -> None:
     from ato_hil.tools.session import realtime
 
-    table = Table("real time, µs", "p50", "p99", "p99.9", "max", header_style="bold")
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for row in realtime.rows(timing):
-        table.add_row(*row)
-    console.print(table)
-    console.print(realtime.verdict(timing), soft_wrap=True)
+    quantities = Column("real time, µs", text=True)
+    rows = [Row(row) for row in realtime.rows(timing)]
+    show(console, [quantities, *map(Column, ("p50", "p99", "p99.9", "max"))], rows)
+    say(realtime.verdict(timing))

@@ -24,7 +24,6 @@ import numpy as np
 from ato_hil.can_dbc.codec import MAILBOX
 from ato_hil.controller import firmware as controller_firmware
 from ato_hil.controller import reference, tick_sources
-from ato_hil.controller.registry import law_step
 from ato_hil.plant_sim import (
     atp,
     plant,
@@ -71,7 +70,7 @@ class Loop:
         plant_params = plant.params_dtype(model.PARAMS)
         plant_state = plant.state_dtype(model.STATE)
         modules = tick_sources.modules_of([law])
-        modules += [importlib.import_module(f"plant_sim.{name}") for name in PLANT_MODULES]
+        modules += [importlib.import_module(f"ato_hil.plant_sim.{name}") for name in PLANT_MODULES]
         modules += [
             importlib.import_module(f"ato_hil.plant_sim.trains.{found.name}")
             for found in pkgutil.iter_modules(trains.__path__)
@@ -90,9 +89,8 @@ class Loop:
             },
         )
         self.program = Program(self.records.name)
-        step = law_step(module)
         _, sense, act = plant.build(model)
-        tick = controller_firmware.build_tick(step)
+        tick = controller_firmware.build_tick(module.step)
         limits = Fields(
             "ato_limits",
             tuple(
@@ -134,7 +132,7 @@ class Loop:
         for module in program.modules:
             body += ["", f"/* {module.file} */"]
             for function in firmware.in_order(program, module):
-                body += ["", *firmware.definition(program, function, self.loop)]
+                body += ["", *firmware.definition(program, function, function is self.loop)]
         heads = [f"static {program.head(f)};" for f in functions if f is not self.loop]
         heads.append(f"{program.head(self.loop)};")
         arrays = [*self._tuple(), *self._several()]
@@ -260,5 +258,5 @@ def run(loaded: Loaded, law: str, runs: range, seed: int) -> Iterator[tuple[list
             seconds = time.perf_counter() - started
 
         nodes = onboard.controllers_for(members(loaded), law)
-        for results in sil.run_line(loaded, nodes, runs=runs, seed=seed, loop=loop):
-            yield [r.frames for r in results], seconds, len(results[0].truth)
+        for run in sil.run_line(loaded, nodes, runs=runs, seed=seed, loop=loop):
+            yield run.frames, seconds, run.ticks

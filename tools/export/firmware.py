@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from ato_hil.can_dbc import codec
 from ato_hil.can_dbc.codec import (
     MAILBOX,
     MESSAGE_COUNT,
@@ -29,7 +28,7 @@ from ato_hil.controller import (
     tick_sources,
 )
 from ato_hil.controller.calibration import Calibration
-from ato_hil.controller.registry import law_label, law_step, load_law
+from ato_hil.controller.registry import Law, law_label, load_law
 from ato_hil.tools.export import ExportError
 from ato_hil.tools.export.kinds import INT, Array, Record
 from ato_hil.tools.export.records import Records, initialiser
@@ -67,7 +66,7 @@ class Firmware:
         return self.calibrations[0]
 
     @property
-    def law(self) -> Any:
+    def law(self) -> Law:
         return load_law(self.first.law)
 
     @property
@@ -92,7 +91,7 @@ class Translated:
         fields: Any = params.fields
         state_fields: Any = state.fields
         self.tick = self.program.root(
-            firmware.build_tick(law_step(law)),
+            firmware.build_tick(law.step),
             (
                 Record(params),
                 Array(reference.SEGMENT),
@@ -131,7 +130,7 @@ def banner(made: Firmware) -> list[str]:
     calibration = made.first
     return [
         f"Made by ato-hil {version()}, `ato-hil export c {made.scenario}"
-        f" --law {law_label(calibration.law)}`; do not edit.",
+        f" --law {Path(calibration.law).name}`; do not edit.",
         f"law {law_label(calibration.law)}, scenario {calibration.scenario_digest},"
         f" sources {library.source_digest(calibration.law)}",
     ]
@@ -153,7 +152,7 @@ def source_file(made: Translated) -> str:
     for module in program.modules:
         body += ["", *comment_lines("", f"{module.file}: {first_line(module.tree)}")]
         for function in in_order(program, module):
-            body += ["", *definition(program, function, made.tick)]
+            body += ["", *definition(program, function, function is made.tick)]
     heads = [f"static {program.head(f)};" for f in functions if f is not made.tick]
     lines = [
         *top(
@@ -201,9 +200,9 @@ def in_order(program: Program, module: Any) -> list[Function]:
     return sorted(found, key=lambda function: (function.step.node.lineno, function.name))
 
 
-def definition(program: Program, function: Function, root: Function) -> list[str]:
+def definition(program: Program, function: Function, is_public: bool) -> list[str]:
     """A function with its docstring."""
-    static = "" if function is root else "static "
+    static = "" if is_public else "static "
     return [
         *(comment_lines("", function.step.docstring) if function.step.docstring else ()),
         static + program.head(function),
@@ -342,8 +341,8 @@ def header_file(made: Translated) -> str:
         period_ms=period_ms(fw),
     )
     text = reflowed(text)
-    law_text = f"The law, {source_of(law).file}:\n\n{inspect.getdoc(law) or ''}"
-    bounds = getattr(law, "STATE_BOUNDS", {})
+    law_text = f"The law, {source_of(law.module).file}:\n\n{inspect.getdoc(law.module) or ''}"
+    bounds = law.STATE_BOUNDS
     lines = [
         *top(fw, text),
         "#ifndef ATO_H",
@@ -368,7 +367,7 @@ def header_file(made: Translated) -> str:
         f"#define ATO_CELLS {cells} /* of the learning memory */",
         f"#define ATO_WORDS {words} /* a cell */",
         "",
-        "/* Run states, in RUN_CTRL and ATO_STATUS, and faults that leave no trace in the memory. */",
+        "/* Run states of RUN_CTRL and ATO_STATUS; faults after which nothing is learned. */",
         *(f"#define ATO_{name} {getattr(interface, name)}" for name in PUBLIC),
         "",
         f"typedef int{width}_t ato_word; /* of the learning memory */",
@@ -396,12 +395,10 @@ def header_file(made: Translated) -> str:
         "",
         "extern const ato_information ATO_INFORMATION;",
         "",
-        "/* Once, when power comes on: no run, the learning memory as before the first one. To go",
-        " * on with what was learned, copy it into cells[state->memory.generation] after that. */",
+        *comment_lines("", INIT),
         "void ato_init(const ato_params *params, ato_state *state, ato_word *cells);",
         "",
-        "/* Once a control period (period 1), and when RUN_CTRL arms or ends a run (period 0). 1 if",
-        " * a run has ended here: now is the time to store cells[state->memory.generation]. */",
+        *comment_lines("", CYCLE),
         "int64_t ato_cycle(const ato_params *params, const ato_segment *profile, ato_state *state,",
         "    ato_word *cells, const ato_mailbox *rx, ato_mailbox *tx, int64_t period);",
         "",
@@ -433,8 +430,9 @@ MANUAL = """The automatic train operation of one train as C99: frames in, frames
 period of {period_ms} ms.
 
 Memory: the caller owns it all. One ato_state ({state} bytes) and one learning memory
-ato_word[2 * ATO_CELLS * ATO_WORDS] ({cells} bytes) for each train, a generation after the other;
-the parameters ({params} bytes) and the timetable are constants. Nothing is allocated, nothing static is written, no floating
+ato_word[2 * ATO_CELLS * ATO_WORDS] ({cells} bytes) for each train: word w of cell c of generation
+g is number (g * ATO_CELLS + c) * ATO_WORDS + w. The parameters ({params} bytes) and the timetable
+are constants. Nothing is allocated, nothing static is written, no floating
 point, no recursion. Several trains, or threads, may run side by side, each on its own state.
 
 Order of calls:
@@ -453,7 +451,16 @@ Bounds: every loop ends after a constant number of turns, calls are at most {dep
 {functions} functions, whatever is in the mailboxes. No call fails. No intermediate leaves 64 bits
 as long as parameters and state are what ato_config.c and these functions made them.
 
-Formats: Qn is an integer in units of 2^-n. x -> y of a range is inclusive."""
+Of what C leaves to the implementation one thing counts, the right shift of a negative number,
+which has to be arithmetic: ato.c does not compile otherwise.
+
+Formats: Qn is an integer in units of 2^-n."""
+
+INIT = """Once, when power comes on: no run, the learning memory as before the first one. To go on
+with what was learned, copy it into the generation state->memory.generation after that."""
+
+CYCLE = """Once a control period (period 1), and when RUN_CTRL arms or ends a run (period 0). 1 if a
+run has ended here: now is the time to store the generation state->memory.generation."""
 
 
 def config_file(made: Translated) -> str:
@@ -532,14 +539,3 @@ def cmake_file(made: Firmware) -> str:
 
 def text_of(lines: list[str]) -> str:
     return "\n".join(line.rstrip() for line in lines).rstrip() + "\n"
-
-
-__all__ = [
-    "Firmware",
-    "Translated",
-    "can_file",
-    "cmake_file",
-    "codec",
-    "config_file",
-    "header_file",
-]

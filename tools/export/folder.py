@@ -28,6 +28,7 @@ def files(scenario: str, law: str | None) -> dict[str, str]:
     raises."""
     loaded = load(scenario)
     law = law or loaded.scenario.law
+    firmware.refuse(law)
     trains = members(loaded)
     fw = Firmware(loaded.name, [onboard.calibration_for(train, law) for train in trains])
     made = Translated(fw)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -74,7 +74,7 @@ class Records:
         """Comments of a record's fields."""
         return self._comments.get(tuple(dtype.names or ()), {})
 
-    def structs(self, bounds: dict[str, tuple[int, int]]) -> Iterator[str]:
+    def structs(self, bounds: Mapping[str, tuple[int, int]]) -> Iterator[str]:
         """Lines that define all records; `bounds` of fields that a law states."""
         for name, dtype in self.made.items():
             home = self._homes[dtype]

@@ -44,8 +44,8 @@ class Module:
 
     @property
     def file(self) -> str:
-        """The path below the folder of its top package, else its name alone."""
-        depth = self.name.count(".") + 1
+        """The path below the folder of the package, else its name alone."""
+        depth = max(self.name.count("."), 1)
         parts = self.path.parts[-depth:]
         return self.path.name if self.name.startswith("own_law.") else "/".join(parts)
 

@@ -58,7 +58,6 @@ from ato_hil.tools.export.source import (
     Step,
     comment_text,
     defining_module,
-    module_of,
     paragraphs,
     python_function,
     source_of,
@@ -395,6 +394,11 @@ class _Places:
     def __init__(self, step: Step) -> None:
         self.seen: dict[str, list[Path]] = {}
         self.loops: dict[str, list[Path]] = {}
+        self.read = {
+            node.id
+            for node in ast.walk(step.node)
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)
+        }
         self._next = 0
         self.blocks: dict[int, Path] = {}  # by id of the list of statements
         self._block(step.body, ())
@@ -634,11 +638,19 @@ class _Body:
                 value = zero[kind.c] if isinstance(kind, Scalar) else "NULL"
                 declared = self._variable(name, kind)
                 self._put(f"{declared} = {value};")
-                self.declared.add(name)
+                self._declare(name)
+
+    def _declare(self, name: str) -> None:
+        """Notes a variable; one that is never read is no warning of the compiler."""
+        self.declared.add(name)
+        if name not in self.places.read:
+            self._put(f"(void){c_name(name)};")
 
     def _variable(self, name: str, kind: Kind) -> str:
         text = self.program.declared(c_name(name), kind, False)
-        return f"\x03{name}\x03{text}" if isinstance(kind, Record | Array) else text
+        # C99 does not take a pointer to arrays as one to arrays of constants.
+        is_flat = isinstance(kind, Array) and isinstance((*kind.inner, "")[0], str)
+        return f"\x03{name}\x03{text}" if isinstance(kind, Record) or is_flat else text
 
     def _assign(self, node: ast.stmt, name: str, value: Expression) -> None:
         if name in self.places.loops and self.places.loop_alone(name):
@@ -669,7 +681,7 @@ class _Body:
             self._put(f"{variable} = {text};")
         else:
             self._put(f"{self._variable(name, kind)} = {text};")
-            self.declared.add(name)
+            self._declare(name)
 
     def _unpack(self, node: ast.stmt, targets: list[ast.expr], value: ast.expr) -> None:
         names = [target.id for target in targets if isinstance(target, ast.Name)]
@@ -1416,16 +1428,3 @@ def fitted(line: str) -> list[str]:
         return [f"{indent}{text} /* {beside} */"]
     above = comment_lines(indent, beside) if beside and not text.startswith("}") else []
     return [*above, *wrapped(indent, text)]
-
-
-__all__ = [
-    "Function",
-    "Program",
-    "comment_lines",
-    "module_of",
-    "name_of",
-    "number_text",
-    "resolved",
-    "settled_constants",
-    "wrapped",
-]

@@ -12,11 +12,9 @@ from typing import Any
 from ato_hil.plant_sim.scenario import (
     Loaded,
     load,
-    members,
     overlaid,
 )
-from ato_hil.tools.runs import onboard, summary_row
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 
 
 @dataclass(frozen=True)
@@ -80,15 +78,7 @@ def runs(
     """Metrics of `count` SIL runs of a scenario, or of one that stands on it with `text`
     replaced."""
     loaded = variant(base, text) if text else load(base)
-    law = law or loaded.scenario.law
-    trains = members(loaded)
-    nodes = onboard.controllers_for(trains, law)
-    rows = []
-    for results in sil.run_line(loaded, nodes, runs=onboard.run_numbers(law, count), seed=seed):
-        row = summary_row.row_of(trains, law, results)
-        faults = [name for result in results for name in result.faults]
-        rows.append({**row, "run": results[0].run, "faults": faults})
-    return rows
+    return [run.row for run in in_process.runs(loaded, law, count, seed=seed)]
 
 
 def variant(base: str, text: str) -> Loaded:

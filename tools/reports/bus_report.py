@@ -19,9 +19,8 @@ import numpy as np
 from ato_hil.can_dbc.codec import MESSAGES, TRAIN_POSITION, database
 from ato_hil.can_dbc.errors import InputError
 from ato_hil.can_dbc.timing import Stream, frame_bits, response_time
-from ato_hil.plant_sim.scenario import Loaded, members, shortened
-from ato_hil.tools.runs import onboard
-from ato_hil.tools.session import sil
+from ato_hil.plant_sim.scenario import Loaded, shortened
+from ato_hil.tools.session import in_process
 
 MEASURED_TICKS = 200
 ANSWER_S = 0.001  # granted to the controller from TRAIN_POSITION to its frames: a tenth of 10 ms
@@ -144,9 +143,8 @@ def traffic(loaded: Loaded, law: str) -> list[Traffic]:
     """What the nodes send, the most urgent message first, measured in one process (SIL); of a line,
     on the bus that carries most."""
     window = shortened(loaded, MEASURED_TICKS)
-    nodes = onboard.controllers_for(members(window), law)
-    results = next(sil.run_line(window, nodes, runs=range(1, 2), seed=1))
-    return list(_traffic(max((result.frames for result in results), key=len), window.ticks))
+    run = next(in_process.runs(window, law, numbers=range(1, 2)))
+    return list(_traffic(max(run.frames, key=len), window.ticks))
 
 
 def _traffic(frames: np.ndarray, ticks: int) -> Iterator[Traffic]:

@@ -8,6 +8,7 @@ once, some ten thousand rows at a time.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,16 +18,10 @@ import pyarrow as pa
 from pyarrow import csv, parquet
 
 from ato_hil.can_dbc import e2e
-from ato_hil.can_dbc.codec import (
-    HEADER,
-    INDEX_OF_FRAME_ID,
-    MESSAGES,
-    database,
-    decode_column,
-)
+from ato_hil.can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGES, database
 from ato_hil.tools.runs import can_logs
 from ato_hil.tools.runs.can_logs import Recorded, RecordError
-from ato_hil.tools.runs.frames import multiplexed_by, physical
+from ato_hil.tools.runs.tables import column, signals, type_of
 
 CHUNK_ROWS = 1 << 16
 NO_RUN = -1
@@ -46,11 +41,17 @@ class Decoded:
     missing: str  # what of the recording could not be read; the table has what comes before
 
 
-def decode(path: Path, out: Path, channel: str | None = None) -> Decoded:
+def decode(
+    path: Path,
+    out: Path,
+    channel: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Decoded:
     """Write the frames of a recording that the DBC knows as a table, whole or not at all. Of a
     recording that is cut off or damaged, those before that.
 
     :param out: a name that ends in .csv or .parquet.
+    :param progress: told how many of how many frames are written.
     :raises RecordError: the recording cannot be read, or the table cannot be written.
     """
     if out.suffix.lower() not in WRITERS:
@@ -68,6 +69,8 @@ def decode(path: Path, out: Path, channel: str | None = None) -> Decoded:
     try:
         with WRITERS[out.suffix.lower()](str(temporary), _schema(messages)) as writer:
             for start in range(0, len(rows), CHUNK_ROWS):
+                if progress:
+                    progress(start, len(rows))
                 writer.write_table(
                     _table(messages, recorded, run, tick, rows[start : start + CHUNK_ROWS])
                 )
@@ -97,17 +100,6 @@ def _places(recorded: Recorded) -> tuple[np.ndarray, np.ndarray]:
     return run, tick
 
 
-def _signals(message: Any) -> list[str]:
-    """Names of a message's signals but for the end-to-end header."""
-    source = database().get_message_by_name(message.name)
-    return [signal.name for signal in source.signals if signal.name not in HEADER]
-
-
-def _type(message: Any, signal: str) -> pa.DataType:
-    """A signal with scale 1 is a number of something, or a code."""
-    return pa.int64() if getattr(message, signal).scale == 1 else pa.float64()
-
-
 def _schema(messages: list[Any]) -> pa.Schema:
     fields = [
         pa.field("time_s", pa.float64()),
@@ -118,10 +110,10 @@ def _schema(messages: list[Any]) -> pa.Schema:
     ]
     for message in messages:
         source = database().get_message_by_name(message.name)
-        for signal in _signals(message):
+        for signal in signals(message):
             unit = source.get_signal_by_name(signal).unit
             name = f"{message.name}.{signal}" + (f" [{unit}]" if unit else "")
-            fields.append(pa.field(name, _type(message, signal)))
+            fields.append(pa.field(name, type_of(message, signal)))
     return pa.schema(fields)
 
 
@@ -141,24 +133,10 @@ def _table(
     ]
     for message in messages:
         mine = np.flatnonzero(frame_ids == message.frame_id)
-        for signal in _signals(message):
-            carried = mine
-            selector = multiplexed_by(message.name, signal)
-            if selector is not None:
-                multiplexer = getattr(message, selector[0])
-                carried = mine[decode_column(words[mine], multiplexer) == selector[1]]
-            columns.append(_column(message, signal, words, carried))
+        columns += [
+            column(message, signal, len(words), mine, words[mine]) for signal in signals(message)
+        ]
     return pa.Table.from_arrays(columns, schema=_schema(messages))
-
-
-def _column(message: Any, signal: str, words: np.ndarray, carried: np.ndarray) -> pa.Array:
-    """Values of one signal, empty but in the rows that carry it."""
-    kind = _type(message, signal)
-    values = np.zeros(len(words), kind.to_pandas_dtype())
-    empty = np.ones(len(words), bool)
-    values[carried] = physical(words[carried], message, signal)
-    empty[carried] = False
-    return pa.array(values, kind, mask=empty)
 
 
 def _intact(codes: np.ndarray, words: np.ndarray) -> np.ndarray:

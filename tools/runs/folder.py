@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,15 +16,20 @@ import msgspec
 import numpy as np
 
 from ato_hil.can_dbc.errors import InputError
+from ato_hil.can_dbc.faults import Event
 from ato_hil.plant_sim.planner import plan_profile
+from ato_hil.plant_sim.plant import TRUTH
 from ato_hil.plant_sim.profile import Profile, evaluate
-from ato_hil.plant_sim.scenario import Scenario
+from ato_hil.plant_sim.scenario import Loaded, Scenario, members
+from ato_hil.tools.runs.frames import FRAME
+from ato_hil.tools.runs.result import Run, Runs
 
-# What the figures use of a trace, which holds much more.
+# What is used of a trace, which holds much more.
 USED = re.compile(
-    r"/(?P<name>truth/\w+|bus/(?:force|car_force|estimate_\d+))/run_(?P<run>\d+)"
+    r"/(?P<name>truth/\w+|bus/(?:force|car_force|estimate_\d+|frames))/run_(?P<run>\d+)"
     r"(?:/train_(?P<train>\d+))?"
 )
+FRAMES = "bus/frames"
 
 
 class FolderError(InputError):
@@ -47,11 +54,85 @@ class Series(NamedTuple):
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder of a session. Reads its trace when it is first asked for."""
+    """A folder of a session. Iterating gives a `Run` for each that was completed. The trace is read
+    when it is first asked for; a folder without one has the rows of its runs and what was injected,
+    but neither frames nor true state."""
 
     path: Path
     summary: dict[str, Any]
     scenario: Scenario
+
+    @property
+    def digest(self) -> str:
+        """Of every frame of all its runs."""
+        return str(self.summary["digest"])
+
+    def __iter__(self) -> Iterator[Run]:
+        """Raises FolderError for a trace that cannot be read."""
+        trains = members(self.loaded)
+        book = Runs(trains, self.law)
+        events = self._injected()
+        for row in self.rows:
+            number = row["run"]
+            faults = [each["faults"] for each in row.get("trains", [row])]
+            seconds = row["ticks"] / row["ticks_per_s"]
+            frames = [self._frames(number, train) for train in range(len(trains))]
+            truths = [self._truth(number, train) for train in range(len(trains))]
+            missing = ""
+            if not all(len(table) for table in (*frames, *truths)):
+                place = self.trace_file if self.trace_file.exists() else f"{self.path}, no trace"
+                missing = f"neither signals nor true state of it in {place}"
+            yield book.add(
+                *(number, frames, truths, faults, seconds),
+                injected=[event for event in events if event.run == number],
+                frames_lost=row.get("frames_lost", 0),
+                recorded=row,
+                missing=missing,
+            )
+
+    @cached_property
+    def loaded(self) -> Loaded:
+        """The scenario as it was loaded then."""
+        period_s = self.scenario.period_s
+        segments = plan_profile(self.scenario.profile, period_s)
+        digest = str(self.summary.get("scenario_digest", ""))
+        file = self.path / "summary.json"
+        return Loaded(
+            *(self.name, file, self.case, (), digest, self.scenario),
+            *(segments, evaluate(segments, period_s)),
+        )
+
+    def _injected(self) -> list[Event]:
+        """Of faults.csv, if there is one."""
+        file = self.path / "faults.csv"
+        try:
+            _heading, *rows = csv.reader(file.read_text(encoding="utf-8").splitlines())
+            return msgspec.convert(rows, list[Event], strict=False)
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError) as error:
+            raise FolderError(f"{file}: cannot be read: {error}") from None
+
+    def _frames(self, run: int, train: int) -> np.ndarray:
+        """[n] of FRAME, empty if the trace does not have them."""
+        found = self._trace.get((FRAMES, run, train))
+        if found is None:
+            return np.zeros(0, FRAME)
+        table = np.zeros(len(found.values), FRAME)
+        table["tick"] = np.rint(found.time_s / self.scenario.period_s)
+        table["frame_id"], table["payload"] = found.values[:, 0], found.values[:, 1]
+        return table
+
+    def _truth(self, run: int, train: int) -> np.ndarray:
+        """[ticks] of plant.TRUTH, likewise."""
+        names = TRUTH.names or ()
+        columns = {name: self._trace.get((f"truth/{name}", run, train)) for name in names}
+        ticks = max((len(c.values) for c in columns.values() if c is not None), default=0)
+        table = np.full(ticks, np.nan, TRUTH)
+        for name, column in columns.items():
+            if column is not None:
+                table[name] = column.line
+        return table
 
     @property
     def label(self) -> str:
@@ -78,11 +159,10 @@ class Folder:
         """Of the runs that were completed."""
         return list(self.summary["runs"])
 
-    @cached_property
+    @property
     def profile(self) -> Profile:
         """The reference, of the leader in a line."""
-        segments = plan_profile(self.scenario.profile, self.scenario.period_s)
-        return evaluate(segments, self.scenario.period_s)
+        return self.loaded.profile
 
     @property
     def reference_time_s(self) -> np.ndarray:
@@ -139,19 +219,26 @@ class Folder:
                 found = USED.fullmatch(str(chunk.entity_path))
                 if found is None or chunk.is_static:
                     continue
-                batch = chunk.to_record_batch()
-                values = batch.column("Scalars:scalars")
                 train = int(found["train"] or 1) - 1
                 parts[found["name"], int(found["run"]), train].append(
-                    (
-                        np.asarray(batch.column("tick")),
-                        np.asarray(values.flatten()).reshape(len(values), -1),
-                    )
+                    _columns(chunk.to_record_batch())
                 )
         except (RuntimeError, ValueError, OSError) as error:
             text = " ".join(str(error).split())
             raise FolderError(f"{self.trace_file}: not a trace of ato-hil: {text}") from None
         return {key: _joined(of_key, self.scenario.period_s) for key, of_key in parts.items()}
+
+
+def _columns(batch: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Ticks, and a row of values for each; of frames a row for each of the frames of a tick."""
+    ticks = np.asarray(batch.column("tick"))
+    names = batch.schema.names
+    if "Scalars:scalars" in names:
+        values = batch.column("Scalars:scalars")
+        return ticks, np.asarray(values.flatten()).reshape(len(values), -1)
+    parts = [batch.column(f"ato_hil.Frames:{name}") for name in ("frame_id", "payload")]
+    counts = np.asarray(parts[0].value_lengths())
+    return np.repeat(ticks, counts), np.column_stack([np.asarray(p.flatten()) for p in parts])
 
 
 def _joined(parts: list[tuple[np.ndarray, np.ndarray]], period_s: float) -> Series:
@@ -161,8 +248,9 @@ def _joined(parts: list[tuple[np.ndarray, np.ndarray]], period_s: float) -> Seri
     return Series(ticks[order] * period_s, values[order])
 
 
-def read(path: Path) -> Folder:
+def read(path: str | Path) -> Folder:
     """The folder of a session. Raises FolderError."""
+    path = Path(path)
     file = path / "summary.json"
     try:
         summary = json.loads(file.read_text(encoding="utf-8"))

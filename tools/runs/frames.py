@@ -19,14 +19,13 @@ from ato_hil.can_dbc.codec import (
     FORCE_CMD,
     RUN_CTRL,
     TRAIN_POSITION,
-    choices,
     database,
     decode_column,
     get,
+    values,
 )
 
-RUN_STATES = choices("RUN_CTRL", "RunState")
-ARMED, RUNNING, ENDED = (RUN_STATES[name] for name in ("armed", "running", "ended"))
+ARMED, RUNNING, ENDED = values("RUN_CTRL", "RunState", "armed running ended")
 TICK_PERIOD = 1 << 16  # of the ticks on the bus
 
 FRAME = np.dtype(

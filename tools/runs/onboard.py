@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 
+from ato_hil.can_dbc.errors import expected, validation
 from ato_hil.controller.calibration import (
     Calibration,
     GuardSettings,
@@ -23,6 +24,8 @@ from ato_hil.plant_sim.scenario import Loaded, Scenario, ScenarioError
 from ato_hil.plant_sim.trains import point
 from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
+EXTERNAL_LAW = "external"  # of a controller that is not ours
+
 
 def calibration_for(loaded: Loaded, law: str) -> Calibration:
     """What the controller is flashed with for one law. Raises ScenarioError with file and key.
@@ -32,8 +35,8 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
     scenario = loaded.scenario
     gains = scenario.laws.get(law_label(law), {} if is_file(law) else None)
     if gains is None:
-        known = ", ".join(sorted(scenario.laws))
-        raise ScenarioError(f"{loaded.path}: no gains for law {law!r}, the scenario has {known}")
+        known = expected(law, sorted(scenario.laws))
+        raise ScenarioError(f"{loaded.path}: no gains for law {law!r}, {known}")
     distribute = scenario.control.distribute
     try:
         return calibrate(
@@ -116,7 +119,14 @@ def _settings(key: str, values: dict[str, Any], kind: Any) -> Any:
     try:
         return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
-        raise CalibrationError(f"{key}: {error}") from None
+        text, place = validation(error, kind)
+        raise CalibrationError(f"{key}{place}: {text}") from None
+
+
+def cars(loaded: Loaded) -> int:
+    """How many cars get a force of their own."""
+    scenario = loaded.scenario
+    return len(scenario.train.effectiveness) if scenario.control.distribute else 0
 
 
 def run_numbers(law: str, runs: int, learned: int = -1) -> range:
@@ -125,7 +135,7 @@ def run_numbers(law: str, runs: int, learned: int = -1) -> range:
     their file)."""
     if learned >= 0:
         return range(learned + 1, learned + 1 + runs)
-    return range(0 if getattr(load_law(law), "INITIAL_RUN", False) else 1, runs + 1)
+    return range(0 if load_law(law).INITIAL_RUN else 1, runs + 1)
 
 
 def error_weight(loaded: Loaded, law: str) -> float | None:

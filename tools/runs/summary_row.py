@@ -13,7 +13,6 @@ from ato_hil.plant_sim.scenario import Loaded, at_rate
 from ato_hil.tools.runs import metrics
 from ato_hil.tools.runs.frames import commanded_force_n, decode, held_values, timetable_rate
 from ato_hil.tools.runs.onboard import error_weight
-from ato_hil.tools.runs.result import RunResult
 
 
 def run_row(
@@ -47,12 +46,6 @@ def run_row(
     worst = {key: _worst(key, [row[key] for row in rows]) for key in rows[0]}
     worst["trains"] = [{"train": number, **row} for number, row in enumerate(rows, start=1)]
     return worst
-
-
-def row_of(members: list[Loaded], law: str, results: list[RunResult]) -> dict[str, Any]:
-    """`run_row` of a run in one process, with a result for each train."""
-    frames, truths = [result.frames for result in results], [result.truth for result in results]
-    return run_row(members, law, frames, truths)
 
 
 def _worst(key: str, values: list[Any]) -> Any:

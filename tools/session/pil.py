@@ -31,9 +31,9 @@ from ato_hil.controller import library
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.interface import fault_names
 from ato_hil.plant_sim import plant, world
-from ato_hil.plant_sim.scenario import Loaded
+from ato_hil.plant_sim.scenario import Loaded, members
 from ato_hil.tools.runs.frames import FRAME
-from ato_hil.tools.runs.result import RunResult
+from ato_hil.tools.runs.result import Run, Runs
 from ato_hil.tools.session import sil
 from ato_hil.tools.session.boards import Board, BoardError
 from ato_hil.tools.session.processes import RunError
@@ -293,15 +293,17 @@ def _digest(calibration: Calibration) -> int:
 
 def run_line(
     loaded: Loaded,
+    law: str,
     started: list[Target],
     *,
     runs: range,
     seed: int,
     progress: Callable[[int, int], None] | None = None,
-) -> Iterator[list[RunResult]]:
+) -> Iterator[Run]:
     """As `sil.run_line`, with the controllers on the targets, one for each train. Raises RunError
     with the tick."""
     here = world.build(loaded, seed)
+    made = Runs(members(loaded), law)
     for number in runs:
         if progress:
             progress(number, 0)
@@ -318,10 +320,8 @@ def run_line(
         _announce(here, started, plant.ENDED, number)
         if progress:
             progress(number, truth.shape[1])
-        yield [
-            RunResult(number, frames[train][:count], truth[train], faults[train], seconds)
-            for train, count in enumerate(counts)
-        ]
+        sent = [of_train[:count] for of_train, count in zip(frames, counts, strict=True)]
+        yield made.add(number, sent, list(truth), faults, seconds)
 
 
 def _drive(

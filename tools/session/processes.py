@@ -101,8 +101,11 @@ class Bench:
         """Whether every accountant has told of a run."""
         return all(run in node.runs for node in self.accountants)
 
-    def start(self, name: str, arguments: list[str]) -> Node:
-        """A child process that speaks JSON lines; its stderr goes to OUT/NAME.log."""
+    def start(
+        self, name: str, arguments: list[str], environment: Mapping[str, str] | None = None
+    ) -> Node:
+        """A child process that speaks JSON lines, with more in its environment; its stderr goes to
+        OUT/NAME.log."""
         log = self.out / f"{name}.log"
         with ExitStack() as stack:
             errors = stack.enter_context(open(log, "w", encoding="utf-8"))
@@ -112,6 +115,7 @@ class Bench:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
+                env={**os.environ, **(environment or {})},
                 start_new_session=True,  # Ctrl-C comes to this process alone
             )
         node = Node(name, process, log)

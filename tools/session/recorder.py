@@ -17,12 +17,7 @@ It says on stdout, in JSON lines:
 
 and takes on stdin, where a file is deleted when it has been read:
 
-    {"command": "reference", "run": 1, "file": "x.npy"}    of a run on a timetable of its own
-    {"command": "truth", "run": 1, "file": "truth.npy"}    true state of the plant, for the trace
-    {"command": "timing", "run": 1, "file": "timing.npy"}  how punctual a run in real time was
-    {"command": "memory", "run": 1, "file": "memory.npy",  the learning memory after it, in the
-     "decimation": 10}                                     units of its words, likewise
-    {"command": "summary", "run": 1, "row": {…}}           the run's row of summary.json, likewise
+    {"command": "facts", "file": "facts_1.npz"}            of a run, for the trace: trace/facts.py
     {"command": "stop"}                                    ends the recording, as SIGTERM, SIGINT
                                                            and the end of stdin do
 
@@ -44,7 +39,7 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import can
 import numpy as np
@@ -72,6 +67,7 @@ from ato_hil.tools.runs.frames import (
     ticks_by_echo,
     ticks_of,
 )
+from ato_hil.tools.trace import facts
 from ato_hil.tools.trace.writer import Reference, TraceWriter
 
 BATCH_TICKS = 1000  # of the trace
@@ -186,25 +182,6 @@ class Recorder:
             if self.tick >= self._logged_tick + BATCH_TICKS:
                 self._log(int(np.searchsorted(self.frames["tick"], self.tick)))
 
-    def obey(self, command: dict[str, Any]) -> None:
-        """Log what the parent knows of a run: `reference`, `truth`, `memory`, `timing` or
-        `summary`."""
-        if self._trace is None:
-            return
-        if command["command"] == "reference":
-            reference = np.load(command["file"]).view(np.recarray)
-            self._trace.reference(command["run"], cast(Reference, reference))
-        elif command["command"] == "memory":
-            cells = np.load(command["file"])
-            self._trace.memory(command["run"], cells, command["decimation"])
-        elif command["command"] == "truth":
-            tables = np.atleast_2d(np.load(command["file"]))  # of all trains
-            self._trace.truth(command["run"], tables[self._train], self._train)
-        elif self._train == 0 and command["command"] == "timing":
-            self._trace.timing(command["run"], np.load(command["file"]))
-        elif self._train == 0:
-            self._trace.run_summary(command["run"], command["row"])
-
     def finish(self, dropped: int = 0) -> None:
         """End a run that was cut short; `dropped` as in `take`. The leader's also ends the trace,
         so it comes last.
@@ -257,12 +234,9 @@ class Recorder:
                 text = f"recorder lost frames: {lost}, the bus dropped {dropped_now}"
                 self._trace.text(number, self.tick, text, "WARN", self._train)
             if self._faults is not None:
-                here = [
-                    event
-                    for event in injected(self._faults)
-                    if (event.run, event.train) == (number, self._train + 1)
-                ]
-                self._trace.faults(number, here, self._train)
+                train = self._train + 1
+                here = [e for e in injected(self._faults) if (e.run, e.train) == (number, train)]
+                facts.apply(facts.Facts(number, injected=here), self._trace)
             if not complete:
                 text = f"cut short at tick {self.tick}"
                 self._trace.text(number, self.tick, text, "WARN", self._train)
@@ -307,8 +281,12 @@ def record(
     taps: list[tuple[can.BusABC, Recorder]],
     commands: queue.SimpleQueue[dict[str, Any]],
     stop: Stop,
+    trace: TraceWriter | None = None,
 ) -> None:
-    """Record until `stop`, or the command of that name. Raises can.CanError if a bus is gone."""
+    """Record until `stop`, or the command of that name; apply what the parent tells the trace.
+
+    Raises can.CanError if a bus is gone.
+    """
     ended = False
     while not (ended or stop.requested):
         heard = listen(taps, IDLE_S)
@@ -317,10 +295,10 @@ def record(
             if command["command"] == "stop":
                 ended = True
             else:
-                for _bus, recorder in taps:
-                    recorder.obey(command)
-                if "file" in command:
-                    Path(command["file"]).unlink()
+                file = Path(command["file"])
+                if trace is not None:
+                    facts.apply(facts.load(file), trace)
+                file.unlink()
         if heard:
             time.sleep(PAUSE_S * len(taps))
     deadline = time.monotonic() + DRAIN_S
@@ -409,7 +387,7 @@ def main() -> int:
     tell("ready")
     status = 0
     try:
-        record(taps, commands, stop)
+        record(taps, commands, stop, trace)
     except can.CanError as error:
         tell("error", message=f"recorder: bus {', '.join(arguments.bus)} is gone: {error}")
         status = 2

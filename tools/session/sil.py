@@ -9,21 +9,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ato_hil.can_dbc.codec import MESSAGE_COUNT, MESSAGES
-from ato_hil.can_dbc.step import step
+from ato_hil.can_dbc.step import INTERPRETED, step
 from ato_hil.controller import node as controller_node
-from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.interface import fault_names
 from ato_hil.plant_sim import plant, world
-from ato_hil.plant_sim.scenario import Loaded
+from ato_hil.plant_sim.scenario import Loaded, members
 from ato_hil.tools.runs.frames import FRAME
-from ato_hil.tools.runs.result import RunResult
+from ato_hil.tools.runs.result import Run, Runs
 
+WATCHED_TICKS = 100  # between two looks at the interpreted loop
 FRAME_IDS = np.array([message.frame_id for message in MESSAGES], np.int32)
 
 
@@ -93,34 +92,6 @@ def build_loop(controller_tick: Any, sense: Any, actuate_and_advance: Any) -> An
     return loop
 
 
-def run(
-    loaded: Loaded,
-    calibration: Calibration,
-    *,
-    runs: range,
-    seed: int,
-    memory_file: Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> Iterator[tuple[RunResult, controller_node.Controller]]:
-    """The runs of a single train numbered `runs`, one after the other; `progress(run, tick)` is
-    called as they go."""
-    node = controller_node.build(calibration, memory_file)
-    yield from run_controller(loaded, node, runs=runs, seed=seed, progress=progress)
-
-
-def run_controller(
-    loaded: Loaded,
-    node: controller_node.Controller,
-    *,
-    runs: range,
-    seed: int,
-    progress: Callable[[int, int], None] | None = None,
-) -> Iterator[tuple[RunResult, controller_node.Controller]]:
-    """The same with a controller that the caller has built."""
-    for (result,) in run_line(loaded, [node], runs=runs, seed=seed, progress=progress):
-        yield result, node
-
-
 def run_line(
     loaded: Loaded,
     nodes: list[controller_node.Controller],
@@ -129,12 +100,17 @@ def run_line(
     seed: int,
     progress: Callable[[int, int], None] | None = None,
     loop: Any = None,
-) -> Iterator[list[RunResult]]:
-    """The runs of all trains, with a controller for each in `nodes`; a result for each. `loop` is
-    another one than that of `build_loop`, with the same arguments."""
+) -> Iterator[Run]:
+    """The runs numbered `runs`, one after the other, of all trains, with a controller for each in
+    `nodes`; `progress(run, tick)` is called as they go; `loop` is another one than that of
+    `build_loop`, with the same arguments."""
     here = world.build(loaded, seed)
+    made = Runs(members(loaded), nodes[0].calibration.law)
     params, state, cells = _put_side_by_side(nodes, here)
-    loop = loop or build_loop(nodes[0].tick, here.sense, here.actuate_and_advance)
+    sense = here.sense
+    if INTERPRETED and progress:  # where a run takes minutes
+        sense = _watched(sense, lambda tick: progress(number, tick))
+    loop = loop or build_loop(nodes[0].tick, sense, here.actuate_and_advance)
     trains = len(nodes)
     counts = np.zeros(trains, np.int64)
 
@@ -157,6 +133,7 @@ def run_line(
             counts,
         )
 
+    number = runs.start
     # Compiles, or loads what was compiled before.
     kinds = (plant.CHANCE, plant.TRUTH, FRAME)
     drive(0, *(world.rows(np.zeros((trains, 0), kind)) for kind in kinds))
@@ -178,10 +155,20 @@ def run_line(
         _announce(here, nodes, plant.ENDED, number)
         if progress:
             progress(number, ticks)
-        yield [
-            RunResult(number, frames[train][: counts[train]], truth[train], faults[train], seconds)
-            for train in range(trains)
-        ]
+        sent = [of_train[:count] for of_train, count in zip(frames, counts, strict=True)]
+        yield made.add(number, sent, list(truth), faults, seconds)
+
+
+def _watched(sense: Any, progress: Callable[[int], None]) -> Any:
+    """`sense` of the interpreted loop, which says now and then where the loop is."""
+
+    def watched(*arguments: Any) -> None:
+        tick = arguments[4]
+        if tick % WATCHED_TICKS == 0:
+            progress(tick)
+        sense(*arguments)
+
+    return watched
 
 
 def _put_side_by_side(

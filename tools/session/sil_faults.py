@@ -30,9 +30,9 @@ from ato_hil.controller.interface import fault_names
 from ato_hil.controller.process import inbox_of
 from ato_hil.plant_sim import failures, plant, world
 from ato_hil.plant_sim.process import controller_name, echoes
-from ato_hil.plant_sim.scenario import Loaded
+from ato_hil.plant_sim.scenario import Loaded, members
 from ato_hil.tools.runs.frames import FRAME
-from ato_hil.tools.runs.result import RunResult
+from ato_hil.tools.runs.result import Run, Runs
 
 ANNOUNCEMENTS = 20  # of an end that a controller does not hear
 
@@ -76,10 +76,11 @@ def run_line(
     fails: Sequence[failures.AnyFailure] = (),
     progress: Callable[[int, int], None] | None = None,
     watch: Watch | None = None,
-) -> Iterator[list[RunResult]]:
+) -> Iterator[Run]:
     """As `sil.run_line`, with the faults of `plan`, and with what fails in the plant. A run
-    that a fault cuts short is the last; its results say why."""
+    that a fault cuts short is the last; it says why."""
     here = world.build(loaded, seed, fails)
+    made = Runs(members(loaded), nodes[0].calibration.law)
     events: list[Event] = []
     sides = [
         Side(
@@ -118,18 +119,15 @@ def run_line(
         ticks = int(here.state[0]["node"]["tick"])
         if progress:
             progress(number, ticks)
-        yield [
-            RunResult(
-                number,
-                np.array(frames[train], FRAME),
-                truth[train, :ticks],
-                faults[train],
-                seconds,
-                cut,
-                [event for event in in_order(events) if event.train == train + 1],
-            )
-            for train in range(len(nodes))
-        ]
+        yield made.add(
+            number,
+            [np.array(of_train, FRAME) for of_train in frames],
+            list(truth[:, :ticks]),
+            faults,
+            seconds,
+            cut=cut,
+            injected=in_order(events),
+        )
         events.clear()
         if cut:
             return

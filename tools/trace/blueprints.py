@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ato_hil.can_dbc.codec import MESSAGES
+from ato_hil.tools.runs import units
 from ato_hil.tools.trace.charts import room
 
 if TYPE_CHECKING:
@@ -31,18 +32,6 @@ RUNS = "violet is the first run, yellow the last"
 TRAINS = "violet is the leading train, yellow the last"
 
 # Endings of names of quantities, longest first, and their units.
-_UNITS = (
-    ("_kwh_per_t", "kWh/t"),
-    ("_per_s", "1/s"),
-    ("_m_s3", "m/s³"),
-    ("_m_s2", "m/s²"),
-    ("_m_s", "m/s"),
-    ("_us", "µs"),
-    ("_j", "J"),
-    ("_m", "m"),
-    ("_n", "N"),
-    ("_s", "s"),
-)
 
 
 @dataclass(frozen=True)
@@ -63,10 +52,9 @@ class Layout:
 
 def title_of(name: str) -> str:
     """Name of a quantity as a person reads it: `max_speed_error_m_s` is Max speed error [m/s]."""
-    for ending, unit in _UNITS:
-        if name.endswith(ending):
-            return f"{name.removesuffix(ending).replace('_', ' ').capitalize()} [{unit}]"
-    return name.replace("_", " ").capitalize()
+    words, unit = units.split(name)
+    title = words.replace("_", " ").capitalize()
+    return f"{title} [{unit}]" if unit else title
 
 
 def of_session(layout: Layout) -> rrb.Blueprint:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ato_hil.can_dbc.errors import InputError
+from ato_hil.can_dbc.errors import InputError, expected
 from ato_hil.tools.trace import live_viewer
 from ato_hil.tools.trace.blueprints import BARS, of_several, title_of
 from ato_hil.tools.trace.colours import REFERENCE, Colour, apart
@@ -293,8 +293,8 @@ def _arrange(viewer: ViewerClient, tab: str | None) -> None:
     if tab is not None:
         found = [path for path, name in names.items() if name.lower() == tab.lower()]
         if not found:
-            known = ", ".join(sorted(filter(None, names.values())))
-            raise ViewError(f"no tab {tab!r}, expected one of {known}")
+            known = sorted(filter(None, names.values()))
+            raise ViewError(f"no tab {tab!r}, {expected(tab, known)}")
         for part in containers.values():
             if part["container_kind"] == "Tabs" and found[0] in part["contents"]:
                 part["active_tab"] = found[0]

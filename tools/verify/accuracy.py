@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from types import ModuleType
 from typing import Any
 
 import msgspec
@@ -20,12 +19,12 @@ from ato_hil.can_dbc.codec import mailboxes
 from ato_hil.can_dbc.step import step
 from ato_hil.controller import firmware, memory, node
 from ato_hil.controller.interface import FAULTS_THAT_BLOCK_LEARNING
-from ato_hil.controller.registry import is_file, law_step, load_law
+from ato_hil.controller.registry import Law, is_file, load_law
 from ato_hil.plant_sim import world
 from ato_hil.plant_sim.scenario import Loaded, load, members
 from ato_hil.tools.papers.reference import Reference, references
 from ato_hil.tools.runs import onboard
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 from ato_hil.tools.verify import (
     ABSENT,
     FAILED,
@@ -53,18 +52,18 @@ def build_pair(fixed: Any, reference: Any) -> Any:
     return pair
 
 
-def params_dtype(module: ModuleType, real: np.ndarray) -> np.dtype:
+def params_dtype(known: Law, real: np.ndarray) -> np.dtype:
     """Params of the pair; `real` is what the reference has."""
     return np.dtype(
-        [("real", real.dtype), ("fixed", module.PARAMS), ("drive", np.int32)], align=True
+        [("real", real.dtype), ("fixed", known.PARAMS), ("drive", np.int32)], align=True
     )
 
 
-def pair_state_dtype(module: ModuleType, reference: Reference, ticks: int) -> np.dtype:
+def pair_state_dtype(known: Law, reference: Reference, ticks: int) -> np.dtype:
     """State of the pair."""
     real = reference.state(ticks)
     return np.dtype(
-        [("real", real), ("difference", np.float64), ("fixed", module.STATE)], align=True
+        [("real", real), ("difference", np.float64), ("fixed", known.STATE)], align=True
     )
 
 
@@ -104,11 +103,11 @@ def _row(
 def differences(law: str, reference: Reference, loaded: Loaded) -> tuple[float, float, float]:
     """Largest differences of force (N), position (m), speed (m/s) between a law and a reference,
     with sensors that only the DBC quantises: a coarser grid would blow a last bit up to a step."""
-    module = load_law(law)
+    known = load_law(law)
     loaded = ideal_sensors(loaded)
     numbers = onboard.run_numbers(law, RUNS)
-    shadow, truths = _runs(module, reference, loaded, law, numbers, drive=0)
-    _follows, reals = _runs(module, reference, loaded, law, numbers, drive=1)
+    shadow, truths = _runs(known, reference, loaded, law, numbers, drive=0)
+    _follows, reals = _runs(known, reference, loaded, law, numbers, drive=1)
     truth, real = np.concatenate(truths, axis=1), np.concatenate(reals, axis=1)
     mass = loaded.scenario.train.mass_kg
     return (
@@ -136,7 +135,7 @@ def reference_runs(law: str, reference: Reference, loaded: Loaded, runs: int) ->
 
 
 def _runs(
-    module: ModuleType,
+    known: Law,
     reference: Reference,
     loaded: Loaded,
     law: str,
@@ -145,11 +144,11 @@ def _runs(
 ) -> tuple[float, list[np.ndarray]]:
     """Largest difference of the force (m/s^2), and the truth of each run, [trains, ticks]."""
     ticks = max(world.run_ticks(loaded, identity.SEED, run) for run in numbers)
-    pairs = [_pair(module, reference, train, law, drive, ticks) for train in members(loaded)]
+    pairs = [_pair(known, reference, train, law, drive, ticks) for train in members(loaded)]
     truth = []
     kept = [pair.state["law"]["real"]["memory"].copy() for pair in pairs]
-    for results in sil.run_line(loaded, pairs, runs=numbers, seed=identity.SEED):
-        truth.append(np.stack([result.truth for result in results]))
+    for run in in_process.drive(loaded, pairs, numbers, identity.SEED):
+        truth.append(np.stack(run.truths))
         for train, pair in enumerate(pairs):
             # As the firmware does: a run with a fault leaves no trace in what is learned.
             if int(pair.state["core"]["faults"][0]) & FAULTS_THAT_BLOCK_LEARNING:
@@ -160,15 +159,15 @@ def _runs(
 
 
 def _pair(
-    module: ModuleType, reference: Reference, loaded: Loaded, law: str, drive: int, ticks: int
+    known: Law, reference: Reference, loaded: Loaded, law: str, drive: int, ticks: int
 ) -> node.Controller:
     """A controller with both forms of the law, for runs of at most so many ticks."""
     calibration = onboard.calibration_for(loaded, law)
     scenario = loaded.scenario
-    gains = msgspec.convert(scenario.laws[law], module.Gains, strict=False)
+    gains = msgspec.convert(scenario.laws[law], known.Gains, strict=False)
     vehicle = onboard.vehicle(scenario)
     real = reference.params(gains, vehicle)
-    params = np.zeros(1, firmware.params_dtype(params_dtype(module, real)))
+    params = np.zeros(1, firmware.params_dtype(params_dtype(known, real)))
     for part in params.dtype.names or ():
         if part != "law":
             params[part] = calibration.params[part]
@@ -176,11 +175,11 @@ def _pair(
     params["law"]["real"] = real
     params["law"]["drive"] = drive
 
-    state = np.zeros(1, firmware.state_dtype(pair_state_dtype(module, reference, ticks)))
+    state = np.zeros(1, firmware.state_dtype(pair_state_dtype(known, reference, ticks)))
     state["links"]["counter"] = -1
     if reference.words:
         state["law"]["real"]["memory"] = reference.initial(gains, vehicle) or 0.0
-    tick = firmware.build_tick(build_pair(law_step(module), reference.force))
+    tick = firmware.build_tick(build_pair(known.step, reference.force))
     return node.Controller(
         calibration=calibration,
         tick=tick,

@@ -1,16 +1,13 @@
-"""Cost per tick: of each part of the firmware's tick, of each law, and against the same algorithm
-in C.
+"""Cost per tick: of each part of the firmware's tick, of each law, and against the same steps as
+exported C.
 
 Python and C run the same rows in turns in one process; the smallest of many rounds counts, which
-other load on the machine can only make larger. Where there is a C twin, its results are compared
-bit for bit as well.
+other load on the machine can only make larger. The results are compared bit for bit as well.
 """
 
 from __future__ import annotations
 
 import ctypes
-import shutil
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -33,13 +30,15 @@ from ato_hil.controller import (
     guard,
     memory,
     node,
-    q,
     reference,
+    tick_sources,
 )
 from ato_hil.controller.interface import INPUTS, OUTPUTS, RUNNING
 from ato_hil.controller.memory import CELL
-from ato_hil.controller.registry import law_step, load_law
+from ato_hil.controller.registry import load_law
 from ato_hil.plant_sim.scenario import load
+from ato_hil.tools.export import ExportError, closed_loop, steps
+from ato_hil.tools.export.kinds import INT, Array
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.verify import (
     ABSENT,
@@ -49,13 +48,11 @@ from ato_hil.tools.verify import (
     overflow,
     row,
 )
-from ato_hil.tools.verify.instructions import C_FOLDER, ToolError
 
 ROWS = 2000  # a loop; its data stay in the cache
 ROUNDS = 200
 RATIO_MAX = 1.3
-C_LAWS = ("pid", "cailc")
-C_FLAGS = ("-O2", "-std=c11", "-Wall", "-Werror", "-shared", "-fPIC")
+C_FLAGS = ("-O2", "-std=c99", "-Wall", "-Werror", "-shared", "-fPIC")
 
 
 def fastest_ns(calls: list[Callable[[], Any]], rounds: int = ROUNDS) -> list[float]:
@@ -99,31 +96,33 @@ def law_records(law: str) -> list[np.ndarray]:
 
 
 def check_law(law: str) -> Iterator[Row]:
-    """Cost of a law's step; for the laws that have a C twin, the ratio to it."""
-    loop = build_law_loop(law_step(load_law(law)))
-    mine = law_records(law)
-    if law not in C_LAWS:
-        (ns,) = fastest_ns([lambda: loop(ROWS, *mine)])
-        yield row("cost", law, f"law step, fastest of {ROUNDS} rounds", f"{ns:.1f} ns a tick", True)
-        return
+    """Cost of a law's step, and the ratio to the same step in C."""
+    loop = build_law_loop(load_law(law).step)
+    mine, theirs = law_records(law), law_records(law)
+    yield _compared(law, law, loop, mine, theirs)
+
+
+def _compared(
+    subject: str, law: str, loop: Any, mine: list[np.ndarray], theirs: list[np.ndarray]
+) -> Row:
+    """A loop over ROWS rows against its export; each has arrays of its own."""
     how = "against C, gcc -O2, same rows, in turns"
-    if shutil.which("gcc") is None:
-        yield Row("cost", law, how, "this machine has no gcc", ABSENT)
-        return
     try:
-        theirs = law_records(law)
-        twin = _twin(law, f"{law}_loop")
-        call = _bound(twin, *theirs)
-        yield _ratio(law, how, lambda: loop(ROWS, *mine), call, [mine, theirs])
-    except ToolError as error:
-        yield Row("cost", law, how, str(error), FAILED)
+        closed_loop.compiler()
+    except ExportError as error:
+        return Row("cost", subject, how, str(error), ABSENT)
+    try:
+        call = _bound(exported(law, loop, theirs), *theirs)
+    except ExportError as error:
+        return Row("cost", subject, how, str(error), FAILED)
+    return _ratio(subject, how, lambda: loop(ROWS, *mine), call, [mine, theirs])
 
 
 def _ratio(subject: str, how: str, mine: Any, theirs: Any, results: list[list[np.ndarray]]) -> Row:
     mine()
     theirs()
     if any(a.tobytes() != b.tobytes() for a, b in zip(*results, strict=True)):
-        return Row("cost", subject, how, "the C twin gives other bits", FAILED)
+        return Row("cost", subject, how, "the exported C gives other bits", FAILED)
     ns, c_ns = fastest_ns([mine, theirs])
     ratio = ns / c_ns
     text = f"{ns:.1f} ns a tick, C {c_ns:.1f} ns, ratio {ratio:.2f}, bound {RATIO_MAX}"
@@ -160,59 +159,21 @@ def e2e_loop(n: Any, words: Any, out: Any) -> None:
 
 def check_frames() -> Iterator[Row]:
     """Codec and end-to-end check against C."""
-    how = "against C, gcc -O2, same words, in turns"
-    if shutil.which("gcc") is None:
-        yield Row("cost", "codec, e2e", how, "this machine has no gcc", ABSENT)
-        return
     words = np.random.default_rng(overflow.SEARCH_SEED).integers(-(2**63), 2**63, ROWS) & ~0xFFFF
-    table = np.zeros((8, 256), np.int16)
-    table[:7], table[7] = e2e._CRC.reshape(7, 256), e2e._CRC_DATA_ID
-    data_id = ctypes.c_int64(FORCE_CMD.data_id)
-    mine, theirs = np.zeros(ROWS, np.int64), np.zeros(ROWS, np.int64)
-    try:
-        twin = _bound(_twin("frames", "codec_loop"), words, theirs)
-        yield _ratio("codec", how, lambda: codec_loop(ROWS, words, mine), twin, [[mine], [theirs]])
-        twin = _bound(_twin("frames", "e2e_loop"), table, data_id, words, theirs)
-        yield _ratio("e2e", how, lambda: e2e_loop(ROWS, words, mine), twin, [[mine], [theirs]])
-    except ToolError as error:
-        yield Row("cost", "codec, e2e", how, str(error), FAILED)
+    for subject, loop in (("codec", codec_loop), ("e2e", e2e_loop)):
+        mine, theirs = ([words, np.zeros(ROWS, np.int64)] for _ in range(2))
+        yield _compared(subject, "pid", loop, mine, theirs)
 
 
-def _definitions() -> list[str]:
-    """What the C twins take from the DBC, controller/q.py and the records."""
-    places = {
-        "SPEED": TRAIN_SPEED.Speed,
-        "QUALITY": TRAIN_SPEED.Quality,
-        "FORCE": FORCE_CMD.Force,
-        "MODE": FORCE_CMD.Mode,
-        "TICK": FORCE_CMD.Tick,
-    }
-    defined = [f"-DSIN_{n}={getattr(q, f'_SIN_{n}')}" for n in (1, 3, 5, 7)]
-    defined += [f"-DWORDS_MAX={memory.WORDS_MAX}", f"-DAHEAD_WORDS={memory.AHEAD_WORDS}"]
-    for record, dtype in (("CELL", CELL), ("INPUTS", INPUTS), ("OUTPUTS", OUTPUTS)):
-        defined.append(f"-D{record}_BYTES={dtype.itemsize}")
-    for name, signal in places.items():
-        defined += [
-            f"-D{name}_START={signal.start}",
-            f"-D{name}_LENGTH={signal.length}",
-            f"-D{name}_SIGNED={signal.is_signed}",
-        ]
-    return defined
-
-
-def _twin(name: str, function: str) -> Any:
-    """A function of c/NAME.c, compiled. Raises ToolError."""
+def exported(law: str, loop: Any, arrays: list[np.ndarray]) -> Any:
+    """A loop as C, compiled; `law` is one whose modules define the records. Raises ExportError."""
+    kinds = [INT, *(Array(array.dtype) for array in arrays)]
+    text = steps.text_of([("ato_loop", loop, kinds)], tick_sources.modules_of([law]))
     with tempfile.TemporaryDirectory(prefix="ato-hil-verify-") as scratch:
-        library = Path(scratch) / f"{name}.so"
-        process = subprocess.run(
-            ["gcc", *C_FLAGS, *_definitions(), "-o", str(library), str(C_FOLDER / f"{name}.c")],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if process.returncode != 0:
-            raise ToolError(f"gcc: {(process.stderr.strip().splitlines() or ['no message'])[-1]}")
-        return getattr(ctypes.CDLL(str(library)), function)
+        source, library = Path(scratch, "loop.c"), Path(scratch, "loop.so")
+        source.write_text(text, encoding="utf-8")
+        closed_loop.build([source], library, C_FLAGS)
+        return ctypes.CDLL(str(library)).ato_loop
 
 
 def _bound(function: Any, *arguments: Any) -> Callable[[], Any]:

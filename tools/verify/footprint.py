@@ -44,9 +44,9 @@ def check(law: str) -> Iterator[Row]:
     """Rows of size and growth."""
     scenario = identity.scenario_of(law)
     controller = node.build(onboard.calibration_for(load(scenario), law))
-    module = load_law(law)
+    known = load_law(law)
     text = (
-        f"law: params {module.PARAMS.itemsize}, state {module.STATE.itemsize};"
+        f"law: params {known.PARAMS.itemsize}, state {known.STATE.itemsize};"
         f" firmware: params {controller.params.nbytes}, state {controller.state_bytes},"
         f" learning memory {controller.memory_bytes}"
     )

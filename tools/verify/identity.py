@@ -10,7 +10,6 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -22,14 +21,11 @@ from ato_hil.controller.registry import is_file, load_law
 from ato_hil.plant_sim.scenario import (
     case_names,
     load,
-    members,
     scenario_names,
     shortened,
 )
-from ato_hil.tools.runs import onboard, summary_row
 from ato_hil.tools.runs.files import write_json
-from ato_hil.tools.runs.frames import LineDigest
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 from ato_hil.tools.verify import (
     ABSENT,
     FAILED,
@@ -69,7 +65,7 @@ def scenarios_of(law: str) -> list[str]:
     are about that one; for a law in a file of its own the one that its SCENARIO names, the default
     scenario without."""
     if is_file(law):
-        return [getattr(load_law(law), "SCENARIO", OWN_LAW_SCENARIO)]
+        return [load_law(law).SCENARIO or OWN_LAW_SCENARIO]
     return [
         name
         for name in case_names()
@@ -99,14 +95,8 @@ def pairs(laws: list[str]) -> list[tuple[str, str]]:
 def measured(scenario: str, law: str, runs: int, ticks: int = 0) -> Golden:
     """Digest and metrics of runs compiled in this process."""
     loaded = shortened(load(scenario), ticks)
-    trains = members(loaded)
-    digest = LineDigest(len(trains))
-    row: dict[str, Any] = {}
-    nodes = onboard.controllers_for(trains, law)
-    for results in sil.run_line(loaded, nodes, runs=onboard.run_numbers(law, runs), seed=SEED):
-        digest.update([result.frames for result in results])
-        row = summary_row.row_of(trains, law, results)
-    return Golden(digest.hex(), runs, {name: row.get(name) for name in GOLDEN_METRICS})
+    *_, last = in_process.runs(loaded, law, runs, seed=SEED)
+    return Golden(last.digest, runs, {name: last.row.get(name) for name in GOLDEN_METRICS})
 
 
 def golden_key(scenario: str, law: str) -> str:

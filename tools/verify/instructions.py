@@ -13,14 +13,13 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 import llvmlite.binding as llvm
 import numpy as np
 
 from ato_hil.controller.interface import INPUTS, OUTPUTS
 from ato_hil.controller.memory import CELL
-from ato_hil.controller.registry import load_law
+from ato_hil.controller.registry import Law, load_law
 from ato_hil.tools.verify import (
     ABSENT,
     FAILED,
@@ -69,15 +68,15 @@ def check(law: str) -> Iterator[Row]:
     yield row(name, law, how, text, ratio <= bound)
 
 
-def count(module: ModuleType, params: list[np.ndarray]) -> list[int]:
+def count(law: Law, params: list[np.ndarray]) -> list[int]:
     """Instructions of each of CASES calls of a law, case after case; the calibrations take turns.
     Raises ToolError."""
     with tempfile.TemporaryDirectory(prefix="ato-hil-verify-") as scratch:
         folder = Path(scratch)
-        (folder / "step.o").write_bytes(_object(native.law(module)))
+        (folder / "step.o").write_bytes(_object(native.law(law)))
         _call(["gcc", "-O2", "-o", "run", str(C_FOLDER / "run.c"), "step.o"], folder)
-        (folder / "cases").write_bytes(_cases(module, params))
-        sizes = [d.itemsize for d in (module.PARAMS, module.STATE, CELL, INPUTS, OUTPUTS)]
+        (folder / "cases").write_bytes(_cases(law, params))
+        sizes = [d.itemsize for d in (law.PARAMS, law.STATE, CELL, INPUTS, OUTPUTS)]
         _call(
             ["valgrind", *CALLGRIND, "./run", "cases", *map(str, sizes)],
             folder,
@@ -107,14 +106,14 @@ define i32 @ato_step(ptr %p, ptr %s, ptr %c, ptr %i, ptr %o) nounwind {{
     return bytes(machine.emit_object(module))
 
 
-def _cases(module: ModuleType, params: list[np.ndarray]) -> bytes:
+def _cases(law: Law, params: list[np.ndarray]) -> bytes:
     random = np.random.default_rng(overflow.SEARCH_SEED)
-    bounds = overflow.state_bounds(module)
+    bounds = overflow.state_bounds(law)
     if isinstance(bounds, str):
         raise ToolError(bounds)
     content = []
     for case in range(CASES):
-        records = overflow.drawn(random, module.STATE, bounds)
+        records = overflow.drawn(random, law.STATE, bounds)
         content += [params[case % len(params)], *records, np.zeros(1, OUTPUTS)]
     return b"".join(record.tobytes() for record in content)
 

@@ -20,7 +20,7 @@ from ato_hil.can_dbc.codec import MAILBOX
 from ato_hil.controller import firmware, reference
 from ato_hil.controller.interface import INPUTS, OUTPUTS
 from ato_hil.controller.memory import CELL
-from ato_hil.controller.registry import law_step
+from ato_hil.controller.registry import Law
 
 
 class RefusedError(ValueError):
@@ -36,18 +36,18 @@ class Native:
     ir: str  # optimised, all other functions internal to the module
 
 
-def law_types(module: Any) -> tuple[Any, ...]:
+def law_types(law: Law) -> tuple[Any, ...]:
     """Types of a law step's arguments: params, state, cell, inputs, outputs."""
-    return tuple(numba.from_dtype(d) for d in (module.PARAMS, module.STATE, CELL, INPUTS, OUTPUTS))
+    return tuple(numba.from_dtype(d) for d in (law.PARAMS, law.STATE, CELL, INPUTS, OUTPUTS))
 
 
-def tick_types(module: Any) -> tuple[Any, ...]:
+def tick_types(law: Law) -> tuple[Any, ...]:
     """Types of the arguments of the firmware's tick around a law."""
     segments, boxes = np.zeros(1, reference.SEGMENT), np.zeros(1, MAILBOX)
     return (
-        numba.from_dtype(firmware.params_dtype(module.PARAMS)),
+        numba.from_dtype(firmware.params_dtype(law.PARAMS)),
         numba.typeof(segments),
-        numba.from_dtype(firmware.state_dtype(module.STATE)),
+        numba.from_dtype(firmware.state_dtype(law.STATE)),
         numba.typeof(np.zeros((2, 1, 1), np.int32)),
         numba.typeof(boxes),
         numba.typeof(boxes),
@@ -55,14 +55,14 @@ def tick_types(module: Any) -> tuple[Any, ...]:
     )
 
 
-def law(module: Any) -> Native:
+def law(law: Law) -> Native:
     """A law's step."""
-    return compiled(law_step(module), law_types(module))
+    return compiled(law.step, law_types(law))
 
 
-def tick(module: Any) -> Native:
+def tick(law: Law) -> Native:
     """The firmware's tick around a law."""
-    return compiled(firmware.build_tick(law_step(module)), tick_types(module))
+    return compiled(firmware.build_tick(law.step), tick_types(law))
 
 
 def compiled(step: Any, arguments: tuple[Any, ...], returns: Any = None) -> Native:

@@ -11,7 +11,6 @@ import argparse
 import sys
 import traceback
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import msgspec
@@ -20,7 +19,7 @@ import numpy as np
 from ato_hil.can_dbc.step import INTERPRETED
 from ato_hil.controller.interface import INPUTS, OUTPUTS
 from ato_hil.controller.memory import CELL
-from ato_hil.controller.registry import law_step, load_law
+from ato_hil.controller.registry import Law, load_law
 from ato_hil.plant_sim.scenario import load
 from ato_hil.tools.runs.onboard import calibration_for
 from ato_hil.tools.verify import asked, identity
@@ -73,10 +72,10 @@ class _Peaks:
 
         step.Checked.__new__ = new  # type: ignore[method-assign]
 
-    def largest(self, law: ModuleType) -> tuple[int, str]:
+    def largest(self, law: Law) -> tuple[int, str]:
         """Bits and place of the largest intermediate in the file of a law, or for a packaged one in
         all laws: they build on each other."""
-        file = place(str(law.__file__))
+        file = place(str(law.module.__file__))
         folder = LAWS if file.startswith(LAWS) else file
         best = max(
             (
@@ -110,17 +109,17 @@ def where(error: BaseException) -> str:
     return f"{place(last.filename)}:{last.lineno}: {error}"
 
 
-def search(module: Any, params: list[np.ndarray], cases: int) -> Report:
-    """Looks for inputs, state and memory on which the step of `module` leaves its integers.
+def search(law: Law, params: list[np.ndarray], cases: int) -> Report:
+    """Looks for inputs, state and memory on which the step of `law` leaves its integers.
 
     Every int32 is free; an int64 field of the state lies in the law's STATE_BOUNDS, which the step
     must keep. Half of the cases are new, half change one word of the case with the largest
     intermediate so far.
     """
-    bounds = state_bounds(module)
+    bounds = state_bounds(law)
     if isinstance(bounds, str):
         return Report(error=bounds)
-    function = law_step(module)
+    function = law.step
     peaks = _Peaks()
     peaks.install()
     random = np.random.default_rng(SEARCH_SEED)
@@ -132,7 +131,7 @@ def search(module: Any, params: list[np.ndarray], cases: int) -> Report:
             chosen = records[int(random.integers(len(records)))]
             _fill(random, chosen, bounds, one=True)
         else:
-            records = drawn(random, module.STATE, bounds)
+            records = drawn(random, law.STATE, bounds)
         state, cell, inputs = (r.copy().view(np.recarray)[0] for r in records)
         chosen_params = params[case % len(params)].view(np.recarray)[0]
         try:
@@ -142,24 +141,23 @@ def search(module: Any, params: list[np.ndarray], cases: int) -> Report:
         for name, (low, high) in bounds.items():
             values = np.atleast_1d(state[name])
             if values.min() < low or values.max() > high:
-                text = f"{place(module.__file__)}: state.{name} left its STATE_BOUNDS"
+                text = f"{place(str(law.module.__file__))}: state.{name} left its STATE_BOUNDS"
                 text += f": {state[name]} ({_show(records)})"
                 return Report(error=text, cases=case + 1)
         if peaks.magnitude() > largest:  # over all cases so far: grows only with a new record
             largest, best = peaks.magnitude(), records
-    bits, at = peaks.largest(module)
+    bits, at = peaks.largest(law)
     return Report(bits=bits, at=at, cases=cases)
 
 
-def state_bounds(module: Any) -> dict[str, tuple[int, int]] | str:
+def state_bounds(law: Law) -> dict[str, tuple[int, int]] | str:
     """Bounds of the state's int64 fields, by name; the reason if a field has none."""
-    stated = getattr(module, "STATE_BOUNDS", {})
-    wide = [n for n in module.STATE.names or () if module.STATE[n].base == np.int64]
+    stated = law.STATE_BOUNDS
+    wide = [n for n in law.STATE.names or () if law.STATE[n].base == np.int64]
     missing = [n for n in wide if n not in stated]
     if missing:
-        return (
-            f"{place(module.__file__)}: STATE_BOUNDS has no bounds of {', '.join(missing)} (int64)"
-        )
+        file = place(str(law.module.__file__))
+        return f"{file}: STATE_BOUNDS has no bounds of {', '.join(missing)} (int64)"
     return {name: (int(low), int(high)) for name, (low, high) in stated.items()}
 
 

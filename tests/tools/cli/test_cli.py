@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import io
 import json
 import math
+import re
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
+from typer.testing import CliRunner
 
-from ato_hil.plant_sim.scenario import scenario_names
+from ato_hil.can_dbc.child import python
+from ato_hil.plant_sim.scenario import load, scenario_names
+from ato_hil.tools.cli import look, main, outline
 
 
 def test_list_names_every_scenario(ato_hil, tmp_path: Path) -> None:
@@ -17,6 +25,64 @@ def test_list_names_every_scenario(ato_hil, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     for name in scenario_names():
         assert name in done.stdout
+
+
+def test_the_list_says_what_the_scenarios_say_when_loaded() -> None:
+    outlines = outline.packaged()
+    assert list(outlines) == scenario_names()
+    for name, outlined in outlines.items():
+        loaded = load(name)
+        assert outlined.title == loaded.scenario.title
+        assert outlined.laws[0] == loaded.scenario.law
+        assert sorted(outlined.laws) == sorted(loaded.scenario.laws)
+        assert outlined.cases == loaded.cases
+
+
+def test_the_list_loads_no_compiler(ato_hil, tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.argv = ['ato-hil', 'list']; from ato_hil.tools.cli.main import app;"
+        "app(standalone_mode=False); print([n for n in ('numba', 'numpy') if n in sys.modules])"
+    )
+    done = subprocess.run(
+        python("-c", program), cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    lines = done.stdout.splitlines()
+    assert lines[-1] == "[]"
+    assert len(lines) == 2 + len(scenario_names())  # one a scenario, cases folded
+
+
+@pytest.mark.parametrize("width", [40, 80])
+def test_a_narrow_list_keeps_one_line_a_scenario(
+    monkeypatch: pytest.MonkeyPatch, width: int
+) -> None:
+    screen = Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
+    monkeypatch.setattr(look, "console", screen)
+    look.list_scenarios()
+    lines = screen.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert max(map(len, lines)) <= width
+    assert [line.split()[0] for line in lines[1:]] == scenario_names()
+
+
+def test_the_version_is_that_of_the_package(ato_hil, tmp_path: Path) -> None:
+    done = ato_hil("--version", cwd=tmp_path)
+    assert done.returncode == 0
+    assert done.stdout == f"ato-hil {importlib.metadata.version('ato-hil')}\n"
+
+
+def test_help_shows_the_commands_in_their_groups() -> None:
+    text = CliRunner().invoke(main.app, ["--help"]).output
+    at = [text.index(f" {panel} ") for panel in main.COMMANDS]
+    assert at == sorted(at)
+    named = [name for commands in main.COMMANDS.values() for name, _function in commands]
+    assert sorted(named) == sorted(set(named))
+    first_words = list(dict.fromkeys(name.split()[0] for name in named))
+    assert re.findall(r"^│ ([a-z-]+) ", text[at[0] :], re.M) == first_words
+
+
+def test_a_command_that_is_a_slip_away_is_suggested() -> None:
+    result = CliRunner().invoke(main.app, ["comapre"])
+    assert result.exit_code == 2
+    assert "Did you mean 'compare'?" in result.output
 
 
 def test_doctor_finds_this_machine_fit(ato_hil, tmp_path: Path) -> None:

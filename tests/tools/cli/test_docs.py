@@ -6,14 +6,17 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
+from ato_hil.can_dbc import faults
 from ato_hil.can_dbc.codec import database
 from ato_hil.tools import papers
-from ato_hil.tools.cli import docs
+from ato_hil.tools.cli import console, docs
 from ato_hil.tools.cli.main import app
 from ato_hil.tools.papers.claims import threshold_text
 
@@ -44,6 +47,38 @@ def test_every_signal_and_every_option_is_there() -> None:
         assert text in commands
     assert "| `[LAWS...]` |" in commands
     assert "    ato-hil replay FILE [OPTIONS]\n" in commands
+
+
+def test_every_option_on_the_page_is_taken() -> None:
+    """Tried, not compared: the parser refuses what it does not have before it shows its help."""
+    tried = []
+    for section in docs.command_line().split("\n## ")[1:]:
+        command = section.partition("\n")[0]
+        for written in re.findall(r"^\| `(--[^`]*)`", section, re.M):
+            names, _, value = written.partition(" ")
+            for name in names.split("/"):
+                values = [re.sub(r"\{(\w+).*", r"\1", value).replace("N", "1")] if value else []
+                done = CliRunner().invoke(app, [*command.split(), name, *values, "--help"])
+                assert done.exit_code == 0, f"{command} {name}: {done.output}"
+                tried.append(f"{command} {name}")
+    assert {"claims --json", "figures --format", "run --no-trace", "view --web"} <= set(tried)
+    assert CliRunner().invoke(app, ["run", "--json-file", "--help"]).exit_code == 2
+
+
+def test_the_page_has_every_exit_status_of_the_program() -> None:
+    page = docs.command_line()
+    for name, status in vars(console).items():
+        if name.startswith("EXIT_"):
+            assert f"\n| {status} | " in page
+
+
+def test_the_faults_of_the_readme_are_faults(tmp_path: Path) -> None:
+    shown = (
+        (ROOT / "README.md").read_text(encoding="utf-8").partition("`my.toml` above may be\n\n")[2]
+    )
+    file = tmp_path / "my.toml"
+    file.write_text(textwrap.dedent(shown.partition("\n\n`")[0]), encoding="utf-8")
+    assert len(faults.load(file, 1, 0.01).bus) == 1
 
 
 def anchors(page: Path) -> set[str]:

@@ -15,6 +15,7 @@ import pytest
 from ato_hil.can_dbc.step import int64, step
 from ato_hil.controller import calibration, node
 from ato_hil.controller.laws import afilc
+from ato_hil.controller.registry import law_of
 from ato_hil.plant_sim import track, world
 from ato_hil.plant_sim.scenario import at_rate, load
 from ato_hil.tools.papers.afilc import reference as reference
@@ -35,7 +36,7 @@ from ato_hil.tools.papers.afilc.claims import (
 )
 from ato_hil.tools.papers.claims import variant
 from ato_hil.tools.runs import onboard
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 
 STRETCHED = "crh3-learning-stretched"
 LIT, LITT, MIN, REV = (
@@ -110,12 +111,11 @@ def test_ticks_that_a_run_does_not_reach_keep_what_they_have(decimation):
     loaded = variant(REV, IDEAL + grid(0, decimation))
     before = None
     cut = 0
-    for result, made in sil.run(
-        loaded, onboard.calibration_for(loaded, "afilc"), runs=range(1, 5), seed=1
-    ):
+    (made,) = onboard.controllers_for([loaded], "afilc")
+    for run in in_process.drive(loaded, [made], range(1, 5), 1):
         after = made.cells[int(made.state[0]["memory"]["generation"])].copy()
-        reached = -(-len(result.truth) // decimation)
-        assert not result.faults
+        reached = -(-run.ticks // decimation)
+        assert run.faults == [[]]
         if before is not None:
             assert (after[reached:] == before[reached:]).all()
             assert (after[reached - 1] != before[reached - 1]).any()
@@ -438,15 +438,17 @@ def calibrate_float(gains, vehicle):
     return params
 
 
-FLOAT_LAW = SimpleNamespace(
-    __name__="afilc_float",
-    PARAMS=FLOAT_PARAMS,
-    STATE=FLOAT_STATE,
-    WORDS=(),
-    ESTIMATES=(),
-    Gains=afilc.Gains,
-    calibrate=calibrate_float,
-    afilc_float=afilc_float,
+FLOAT_LAW = law_of(
+    SimpleNamespace(
+        __name__="afilc_float",
+        PARAMS=FLOAT_PARAMS,
+        STATE=FLOAT_STATE,
+        WORDS=(),
+        ESTIMATES=(),
+        Gains=afilc.Gains,
+        calibrate=calibrate_float,
+        afilc_float=afilc_float,
+    )
 )
 
 

@@ -20,12 +20,13 @@ from ato_hil.controller import calibration, node
 from ato_hil.controller.interface import RUNNING
 from ato_hil.controller.laws import drac, drac_robust
 from ato_hil.controller.quantise import Vehicle
+from ato_hil.controller.registry import law_of
 from ato_hil.plant_sim.scenario import Loaded, load
 from ato_hil.tools.runs import onboard
-from ato_hil.tools.runs.frames import Digest, commanded_force_n
+from ato_hil.tools.runs.frames import commanded_force_n
 from ato_hil.tools.runs.lyapunov import has_lyapunov, lyapunov
 from ato_hil.tools.runs.metrics import run_metrics
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 
 BASES = {"34": "crh3-varying", "const": "crh3-paper"}
 
@@ -232,15 +233,17 @@ def drac_float(params, state, cell, inputs, outputs):
     outputs.status = 0
 
 
-FLOAT_LAW = SimpleNamespace(
-    __name__="drac_float",
-    PARAMS=FLOAT_PARAMS,
-    STATE=FLOAT_STATE,
-    WORDS=(),
-    ESTIMATES=(),
-    Gains=FloatGains,
-    calibrate=calibrate_float,
-    drac_float=drac_float,
+FLOAT_LAW = law_of(
+    SimpleNamespace(
+        __name__="drac_float",
+        PARAMS=FLOAT_PARAMS,
+        STATE=FLOAT_STATE,
+        WORDS=(),
+        ESTIMATES=(),
+        Gains=FloatGains,
+        calibrate=calibrate_float,
+        drac_float=drac_float,
+    )
 )
 
 
@@ -367,23 +370,22 @@ def drive(tmp_path_factory):
                     patch.setattr(module, "load_law", lambda name: FLOAT_LAW)
             patch.setattr(node, "build", lambda *arguments: built(law, *arguments))
             key = "drac-robust" if law == "float" else law
-            runs = sil.run(loaded, onboard.calibration_for(loaded, key), runs=range(1, 2), seed=1)
-            ((result, made),) = [(result, made) for result, made in runs]
-        command_n = commanded_force_n(result.frames, loaded.ticks)
+            made = node.build(onboard.calibration_for(loaded, key))
+            (result,) = in_process.drive(loaded, [made], range(1, 2), 1)
+        (frames,), (truth,), (faults,) = result.frames, result.truths, result.faults
+        command_n = commanded_force_n(frames, loaded.ticks)
         traced = None
         if law != "float" and has_lyapunov(loaded, law):
-            traced = lyapunov(loaded, law, result.frames, result.truth)["lyapunov"]
-        digest = Digest()
-        digest.update(result.frames)
+            traced = lyapunov(loaded, law, frames, truth)["lyapunov"]
         return Run(
             loaded,
-            result.truth,
+            truth,
             command_n,
             made.cells[0],
             traced,
-            run_metrics(loaded, result.truth, command_n, None),
-            result.faults,
-            digest.hex(),
+            run_metrics(loaded, truth, command_n, None),
+            faults,
+            result.digest,
         )
 
     def drive(base, law, gains, *overlays):

@@ -18,12 +18,13 @@ from ato_hil.can_dbc.step import step
 from ato_hil.controller import calibration, node
 from ato_hil.controller.interface import INPUTS
 from ato_hil.controller.laws import iplc
+from ato_hil.controller.registry import law_of
 from ato_hil.plant_sim.scenario import load, overlaid
 from ato_hil.tools.papers.iplc.reference import REFERENCES
 from ato_hil.tools.runs import onboard
-from ato_hil.tools.runs.frames import Digest, commanded_force_n
+from ato_hil.tools.runs.frames import commanded_force_n
 from ato_hil.tools.runs.metrics import run_metrics
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 from ato_hil.tools.verify import accuracy
 
 REFERENCE = REFERENCES["iplc"]
@@ -45,16 +46,16 @@ def learn(name, runs, **overlay):
 @cache
 def _learn(name, runs, overlay):
     loaded = overlaid(name, json.loads(overlay))
-    calibrated = onboard.calibration_for(loaded, "iplc")
     rows = []
-    for result, _node in sil.run(loaded, calibrated, runs=range(runs + 1), seed=1):
-        command_n = commanded_force_n(result.frames, loaded.ticks)
+    for run in in_process.runs(loaded, "iplc", numbers=range(runs + 1)):
+        command_n = commanded_force_n(run.frames[0], loaded.ticks)
+        (truth,) = run.truths
         rows.append(
-            run_metrics(loaded, result.truth, command_n, None)
-            | {"faults": result.faults, "end_m": result.truth["position_m"][-1]}
+            run_metrics(loaded, truth, command_n, None)
+            | {"faults": run.faults[0], "end_m": truth["position_m"][-1]}
         )
     mass_kg = loaded.scenario.train.mass_kg
-    rows[-1] |= {"u": command_n / mass_kg, "truth": result.truth}
+    rows[-1] |= {"u": command_n / mass_kg, "truth": truth}
     return rows
 
 
@@ -122,14 +123,10 @@ def test_what_the_brakes_take_up_comes_back_in_part():
 
 def test_a10_the_same_inputs_give_the_same_bits():
     loaded = load("gradient:VI")
-    digests = []
-    for _ in range(2):
-        digest = Digest()
-        calibrated = onboard.calibration_for(loaded, "iplc")
-        for result, _node in sil.run(loaded, calibrated, runs=range(3), seed=1):
-            digest.update(result.frames)
-        digests.append(digest.hex())
-    assert digests[0] == digests[1]
+    one, other = (
+        [run.digest for run in in_process.runs(loaded, "iplc", numbers=range(3))] for _ in range(2)
+    )
+    assert one == other
 
 
 def test_the_paper_s_weights_unlearn_a_good_first_run():
@@ -311,10 +308,12 @@ def iplc_without_sums(params, state, cell, inputs, outputs):
     iplc.iplc(params, state, cell, inputs, outputs)
 
 
-WITHOUT_SUMS = SimpleNamespace(
-    **{name: value for name, value in vars(iplc).items() if not name.startswith("__")},
-    __name__="iplc_without_sums",
-    iplc_without_sums=iplc_without_sums,
+WITHOUT_SUMS = law_of(
+    SimpleNamespace(
+        **{name: value for name, value in vars(iplc).items() if not name.startswith("__")},
+        __name__="iplc_without_sums",
+        iplc_without_sums=iplc_without_sums,
+    )
 )
 
 
@@ -396,10 +395,8 @@ def test_the_p_type_baseline_learns_slowly():
     """u_n = u_{n-1} + 0.002 e_v; its run 1 is the first, so its run n + 1 is our run n."""
     loaded = load(PAPER)
     rows = [
-        run_metrics(loaded, result.truth, result.truth["force_n"], None)
-        for result, _node in sil.run(
-            loaded, onboard.calibration_for(loaded, "p-ilc"), runs=range(1, 12), seed=1
-        )
+        run_metrics(loaded, run.truths[0], run.truths[0]["force_n"], None)
+        for run in in_process.runs(loaded, "p-ilc", numbers=range(1, 12))
     ]
     assert s(rows[0]) == pytest.approx(21230, rel=1e-3)  # it stands
     assert [v(rows[1]), v(rows[10])] == pytest.approx([26.9, 10.7], rel=0.01)

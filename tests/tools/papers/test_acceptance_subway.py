@@ -23,8 +23,7 @@ from ato_hil.plant_sim.scenario import load
 from ato_hil.plant_sim.trains import lumped
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.frames import commanded_force_n, decode
-from ato_hil.tools.runs.metrics import run_metrics
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 
 FAST = "[laws.cailc]\nGamma = [1e5, 1.0, 0.001]\nr_max = 0.75\n"
 EMBEDDED = f"{FAST}alpha = 2.0\n"
@@ -66,19 +65,14 @@ def learn(tmp_path):
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}.toml"
         path.write_text(f'base = "{base}"\n{text}')
         loaded = load(str(path))
-        calibration = onboard.calibration_for(loaded, law)
-        rows = []
-        numbers = onboard.run_numbers(law, runs)
-        for result, node in sil.run(loaded, calibration, runs=numbers, seed=1):
-            command_n = commanded_force_n(result.frames, loaded.ticks)
-            alpha = onboard.error_weight(loaded, law)
-            rows.append(
-                run_metrics(loaded, result.truth, command_n, alpha)
-                | {"faults": result.faults}
-                | {"coupler_force_n": result.truth["coupler_force_n"].max()}
-                | {"memory_bytes": node.memory_bytes}
-            )
-        return rows
+        (node,) = onboard.controllers_for([loaded], law)
+        return [
+            run.metrics
+            | {"faults": run.faults[0]}
+            | {"coupler_force_n": run.truths[0]["coupler_force_n"].max()}
+            | {"memory_bytes": node.memory_bytes}
+            for run in in_process.drive(loaded, [node], onboard.run_numbers(law, runs), 1)
+        ]
 
     return learn
 
@@ -151,15 +145,15 @@ def test_a5_the_firmware_computes_the_law():
     for position_m, speed_m_s in (exact, rounded):
         theta = np.tile(np.array(gains["Xi_initial"]), (loaded.ticks, 1))
         largest = 0.0
-        calibration = onboard.calibration_for(loaded, "cailc")
-        for result, _node in sil.run(loaded, calibration, runs=range(1, 11), seed=1):
-            _, x = decode(result.frames, TRAIN_POSITION, "Position")
-            _, v = decode(result.frames, TRAIN_SPEED, "Speed")
+        for run in in_process.runs(loaded, "cailc", 10):
+            (frames,) = run.frames
+            _, x = decode(frames, TRAIN_POSITION, "Position")
+            _, v = decode(frames, TRAIN_SPEED, "Speed")
             ed = v - speed_m_s
             d = gains["alpha"] * (x - position_m) + ed
             theta = float_update(gains, theta, v, d)
             wanted = float_force(gains, mass, theta, v, ed, d, profile.acceleration_m_s2)
-            given = commanded_force_n(result.frames, loaded.ticks)
+            given = commanded_force_n(frames, loaded.ticks)
             largest = max(largest, abs(given - wanted).max())
         differences.append(largest)
     assert differences[0] <= 20.0
@@ -179,8 +173,7 @@ def test_a5_the_train_runs_as_with_the_law_in_floating_point():
     train, channels = state["train"], state["actuator"]
     reference = np.column_stack([loaded.profile.position_m, loaded.profile.speed_m_s])
     theta = np.tile(np.array(gains["Xi_initial"]), (loaded.ticks, 1))
-    calibration = onboard.calibration_for(loaded, "cailc")
-    for result, _node in sil.run(loaded, calibration, runs=range(1, 3), seed=1):
+    for run in in_process.runs(loaded, "cailc", 2):
         lumped.reset(params["train"], train)
         actuator.reset(channels)
         positions = np.zeros(loaded.ticks)
@@ -196,7 +189,7 @@ def test_a5_the_train_runs_as_with_the_law_in_floating_point():
             lumped.command(params, state)
             actuator.shift(channels)
             lumped.advance(params["train"], here.track, train, params["actuator"], channels, 0.0)
-        assert abs(result.truth["position_m"] - positions).max() <= 8e-6
+        assert abs(run.truths[0]["position_m"] - positions).max() <= 8e-6
 
 
 # The barrier.
@@ -312,15 +305,14 @@ def test_ten_per_cent_of_mass_error_need_wide_bounds(learn):
 def first_run_of_the_default():
     """Car forces [cars, ticks] and total [ticks], N, of the default scenario."""
     loaded = load("subway")
-    calibration = onboard.calibration_for(loaded, "cailc")
-    result, _node = next(sil.run(loaded, calibration, runs=range(1, 2), seed=1))
+    (frames,) = next(in_process.runs(loaded, "cailc", 1)).frames
     signals = [
         (message, f"Car{car}")
         for message, cars in ((CAR_FORCE_1, (1, 2)), (CAR_FORCE_2, (3, 4)), (CAR_FORCE_3, (5, 6)))
         for car in cars
     ]
-    cars = np.array([decode(result.frames, message, signal)[1] for message, signal in signals])
-    return cars, commanded_force_n(result.frames, loaded.ticks)
+    cars = np.array([decode(frames, message, signal)[1] for message, signal in signals])
+    return cars, commanded_force_n(frames, loaded.ticks)
 
 
 def test_a11_the_cars_give_the_total():

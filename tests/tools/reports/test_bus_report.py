@@ -19,8 +19,7 @@ from ato_hil.tools.reports.bus_report import (
     analyse,
     traffic,
 )
-from ato_hil.tools.runs import onboard
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 
 ALWAYS = {"RUN_CTRL", "ATP_LIMIT", "TRAIN_SPEED", "TRAIN_POSITION"}
 ALWAYS |= {"FORCE_CMD", "ATO_STATUS", "ATO_TRACKING"}
@@ -56,9 +55,8 @@ def test_the_table_is_what_a_whole_run_sends(scenario: str, law: str, more: set[
     loaded = load(scenario)
     sent = traffic(loaded, law)
     assert {each.name for each in sent} == ALWAYS | more
-    calibration = onboard.calibration_for(loaded, law)
-    result, _node = next(sil.run(loaded, calibration, runs=range(1, 2), seed=1))
-    ids, counts = np.unique(result.frames["frame_id"], return_counts=True)
+    (frames,) = next(in_process.runs(loaded, law, 1)).frames
+    ids, counts = np.unique(frames["frame_id"], return_counts=True)
     counted = dict(zip(ids.tolist(), counts.tolist(), strict=True))
     assert set(counted) == {each.frame_id for each in sent}
     for each in sent:

@@ -43,7 +43,7 @@ def messages() -> list[can.Message]:
 
 def strangers() -> list[can.Message]:
     """A frame of each kind that is not ours, as python-can knows them."""
-    common: Any = {"timestamp": 99.0, "channel": 0}
+    common: dict[str, Any] = {"timestamp": 99.0, "channel": 0}
     return [
         can.Message(arbitration_id=0x90, is_extended_id=True, data=bytes(8), **common),
         can.Message(arbitration_id=0x90, is_extended_id=False, is_remote_frame=True, **common),
@@ -134,8 +134,8 @@ def test_a_compressed_file(whole: Path) -> None:
             assert cut.words.tolist() == WORDS[: len(cut.words)]
     torn = bytearray(content)
     torn[-6] ^= 1  # of its checksum
-    found = read_bytes(packed, bytes(torn))
-    assert "its compressed data: CRC check failed" in found.missing
+    with pytest.raises(RecordError, match="its compressed data are damaged: CRC check failed"):
+        read_bytes(packed, bytes(torn))
     with pytest.raises(RecordError, match="is not compressed by gzip, as its name says"):
         read_bytes(packed, whole.read_bytes())
     with pytest.raises(RecordError, match=r"is compressed by gzip: its name should end in \.gz"):
@@ -148,7 +148,6 @@ def test_frames_of_other_kinds_are_counted(tmp_path: Path) -> None:
         path = tmp_path / f"mixed.{suffix}"
         with_writer(path, messages() + strangers())
         found = can_logs.read(path)
-        # candump's error frames are on a channel of python-can's own.
         assert found.left_out == counted, suffix
         assert (found.missing, found.words.tolist()) == ("", WORDS)
         (note,) = found.notes()
@@ -404,6 +403,8 @@ def test_names_of_the_dbc_stand_for_identifiers(tmp_path: Path) -> None:
         ("2.5 1 90 Rx d D 00 00 00 00 00 00 00 00", "with a DLC above 8"),
         ("2.5 CANFD 1 Rx 90 1 0 8 8 11 22 33 44 55 66 77 88 0 0 303000 0 0", "CAN FD"),
         ("2.5 CANFD 1 Rx 90 A_Name 1 0 8 8 11 22 33 44 55 66 77 88 0 0 1000", "CAN FD"),
+        ("2.5 CANFD 1 Rx 90 1 0 8 8 11 22 33 44 55 66 77 88 0 0 0 0 0", "CAN FD"),
+        ("2.5 CANFD 1 Rx 90 0 0 f 64" + " 11" * 64 + " 0 0 200000 0 0", "CAN FD"),
         ("2.5 CANFD 5 Tx ErrorFrame Not Acknowledge error", "error"),
         ("2.5 CANXL 1 Rx 90 0 0", "CAN XL"),
         ("2.5 LIN1 3c Rx 8 00 00 00 00 00 00 00 00", None),
@@ -441,6 +442,11 @@ def test_a_line_that_is_no_event_is_damage(tmp_path: Path, line: str) -> None:
     assert len(found.words) == 3
     assert found.missing.startswith("damaged after frame 3: line 6: ")
     assert found.missing.endswith("the 5 lines after it are not read")
+
+
+def test_the_first_event_is_not_taken_for_a_header(tmp_path: Path) -> None:
+    with pytest.raises(RecordError, match=r"line 2: '0,5 1 90 Rx d 8 .*', expected an event"):
+        asc(tmp_path, "base hex\n0,5 1 90 Rx d 8 1F 20 12 00 00 00 00 00\n" + BODY)
 
 
 def test_a_trigger_block_without_end_is_cut_off(tmp_path: Path) -> None:
@@ -514,7 +520,7 @@ def test_an_object_that_cannot_be(tmp_path: Path, bad: bytes, says: str) -> None
     found = blf(tmp_path / "x.blf", [thing() + thing() + bad], count=5)
     assert len(found.words) == 2
     assert found.missing.startswith(says)
-    assert found.missing.endswith(" of 5 objects read)")
+    assert found.missing.endswith(" objects read, 5 announced)")
 
 
 @pytest.mark.parametrize(

@@ -5,17 +5,15 @@ import pytest
 
 from ato_hil.plant_sim import atp
 from ato_hil.plant_sim.scenario import load
-from ato_hil.tools.runs import metrics, onboard
-from ato_hil.tools.session import sil
+from ato_hil.tools.runs import metrics
+from ato_hil.tools.session import in_process
 
 
 def last_run(name, runs):
     """Truth, row of the summary and faults of the last run."""
     loaded = load(name)
-    *_, (result, _node) = sil.run(
-        loaded, onboard.calibration_for(loaded, "cailc"), runs=range(1, runs + 1), seed=1
-    )
-    return result.truth, metrics.supervision(result.truth), result.faults
+    *_, last = in_process.runs(loaded, "cailc", runs)
+    return last.truths[0], metrics.supervision(last.truths[0]), last.faults[0]
 
 
 @pytest.mark.long

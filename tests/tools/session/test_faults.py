@@ -18,8 +18,8 @@ from ato_hil.plant_sim import failures
 from ato_hil.plant_sim.scenario import load, members
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.frames import held
-from ato_hil.tools.runs.result import RunResult
-from ato_hil.tools.session import session, sil_faults
+from ato_hil.tools.runs.result import Run
+from ato_hil.tools.session import in_process, session
 from ato_hil.tools.session.processes import RunError
 
 FAULTS = """
@@ -255,18 +255,16 @@ def test_a_signal_ends_the_run_with_its_cause(
     assert int(row["tick"]) >= 100
 
 
-def first_run(scenario: str, law: str, file: Path) -> tuple[Any, list[RunResult]]:
-    """Parameters of the first controller, and run 1 of each train with these faults."""
+def first_run(scenario: str, law: str, file: Path) -> tuple[Any, Run]:
+    """Parameters of the first controller, and run 1 with these faults."""
     loaded = load(scenario)
     nodes = onboard.controllers_for(members(loaded), law)
-    (results,) = sil_faults.run_line(
-        *(loaded, nodes),
-        runs=range(1, 2),
-        seed=1,
+    (run,) = in_process.drive(
+        *(loaded, nodes, range(1, 2), 1),
         plan=faults.load(file, 1, loaded.scenario.period_s),
         fails=failures.load(file),
     )
-    return nodes[0].params[0], results
+    return nodes[0].params[0], run
 
 
 WRONG_FROM = 900  # tick, from which on the train is faster than 3.5 m/s for 1.2 s
@@ -287,12 +285,12 @@ def test_sensors_that_disagree_stop_the_train_in_the_time_that_is_stated(
 ) -> None:
     file = tmp_path / "faults.toml"
     file.write_text(f"[[sensor]]\n{fault}\nfrom_tick = {WRONG_FROM}\n")
-    params, (result,) = first_run(str(short), "pid", file)
+    params, run = first_run(str(short), "pid", file)
     bound = reaction_ticks(params["plausibility"], wrong_m_s)
     assert bound is not None
-    assert min(result.truth["speed_m_s"][WRONG_FROM : WRONG_FROM + 120]) > 3.5
-    assert result.faults[0] == "position and speed disagree"
-    guard = held(result.frames, len(result.truth), ATO_STATUS, "Guard")
+    assert min(run.truths[0]["speed_m_s"][WRONG_FROM : WRONG_FROM + 120]) > 3.5
+    assert run.faults[0][0] == "position and speed disagree"
+    guard = held(run.frames[0], run.ticks, ATO_STATUS, "Guard")
     assert set(guard[:WRONG_FROM]) == {GUARD_NORMAL}
     assert set(guard[WRONG_FROM + bound + 1 :]) == {GUARD_SERVICE_BRAKE}
 
@@ -302,9 +300,9 @@ def test_a_wheel_that_slips_a_little_deceives_both(short: Path, tmp_path: Path) 
     """Speed and position come from one wheel here: they agree. See docs/faults.md."""
     file = tmp_path / "faults.toml"
     file.write_text(f'[[sensor]]\nkind = "slip"\nshare = 0.1\nfrom_tick = {WRONG_FROM}\n')
-    _params, (result,) = first_run(str(short), "pid", file)
-    assert result.faults == []
-    assert result.truth["position_m"][-1] < 44.0  # of 45: it stops short
+    _params, run = first_run(str(short), "pid", file)
+    assert run.faults == [[]]
+    assert run.truths[0]["position_m"][-1] < 44.0  # of 45: it stops short
 
 
 @pytest.mark.long
@@ -320,8 +318,8 @@ def test_positions_that_are_missing_or_late_cost_no_more_than_millimetres(
     found = []
     for text in ("", f'[[bus]]\nmessages = ["TRAIN_POSITION"]\nat = "controller"\n{fault}\n'):
         file.write_text(text)
-        _params, results = first_run(scenario, load(scenario).scenario.law, file)
-        assert {name for result in results for name in result.faults} <= {"tick jumped"}
-        found.append([result.truth["position_m"] for result in results])
+        _params, run = first_run(scenario, load(scenario).scenario.law, file)
+        assert {name for names in run.faults for name in names} <= {"tick jumped"}
+        found.append([truth["position_m"] for truth in run.truths])
     for without, within in zip(*found, strict=True):
         assert 0.0 < abs(without - within).max() < 0.005

@@ -49,11 +49,11 @@ def digests(loaded: Loaded, law: str, board: boards.Board, runs: int) -> tuple[s
         image.built(loaded, law, board) as file,
         pil.targets(file, board, calibrations) as started,
     ):
-        for results in pil.run_line(loaded, started, runs=numbers, seed=1):
-            in_pil.update([result.frames for result in results])
+        for run in pil.run_line(loaded, law, started, runs=numbers, seed=1):
+            in_pil.update(run.frames)
     nodes = onboard.controllers_for(trains, law)
-    for results in sil.run_line(loaded, nodes, runs=numbers, seed=1):
-        in_sil.update([result.frames for result in results])
+    for run in sil.run_line(loaded, nodes, runs=numbers, seed=1):
+        in_sil.update(run.frames)
     return in_pil.hex(), in_sil.hex()
 
 
@@ -273,7 +273,7 @@ def test_a_target_that_is_not_as_it_should_be(
         pytest.raises((RunError, boards.BoardError)) as failure,
         pil.targets(made, M4, calibrations(loaded, "cailc")) as started,
     ):
-        for _ in pil.run_line(loaded, started, runs=range(1, 2), seed=1):
+        for _ in pil.run_line(loaded, "cailc", started, runs=range(1, 2), seed=1):
             pass
     assert re.fullmatch(said.replace("IMAGE", re.escape(str(made))), str(failure.value))
 
@@ -296,7 +296,7 @@ def test_an_emulator_that_dies_or_stops(
                 os.kill(emulators(pid)[0], number)
 
         with pytest.raises(RunError, match=said):
-            for _ in pil.run_line(short, started, runs=range(1, 2), seed=1, progress=strike):
+            for _ in pil.run_line(short, "pid", started, runs=range(1, 2), seed=1, progress=strike):
                 pass
     assert emulators(pid) == []
 

@@ -39,8 +39,8 @@ def digest(scenario: str, law: str, ticks: int, runs: int) -> str:
         pil.targets(file, BOARD, calibrations) as started,
     ):
         numbers = onboard.run_numbers(law, runs)
-        for results in pil.run_line(loaded, started, runs=numbers, seed=identity.SEED):
-            found.update([result.frames for result in results])
+        for run in pil.run_line(loaded, law, started, runs=numbers, seed=identity.SEED):
+            found.update(run.frames)
     return found.hex()
 
 

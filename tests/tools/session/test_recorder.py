@@ -47,7 +47,8 @@ from ato_hil.tools.session.recorder import (
     lost_frames,
     save_settings,
 )
-from ato_hil.tools.trace import live_viewer
+from ato_hil.tools.trace import facts, live_viewer
+from ato_hil.tools.trace.facts import Facts
 
 STATES = choices("RUN_CTRL", "RunState")
 ARMED, RUNNING, ENDED = STATES["armed"], STATES["running"], STATES["ended"]
@@ -117,15 +118,6 @@ class Log:
 
     def text(self, run: int, tick: int, message: str, level: str = "INFO", train: int = 0) -> None:
         self.calls.append(("text", run, tick, message, level))
-
-    def truth(self, run: int, table: np.ndarray, train: int = 0) -> None:
-        self.calls.append(("truth", run, table))
-
-    def memory(self, run: int, cells: np.ndarray, decimation: int) -> None:
-        self.calls.append(("memory", run, cells.tolist(), decimation))
-
-    def run_summary(self, run: int, row: dict[str, Any]) -> None:
-        self.calls.append(("summary", run, row))
 
     def close(self) -> None:
         self.calls.append(("close",))
@@ -288,23 +280,6 @@ def test_the_trace_gets_whole_ticks_while_a_run_goes_on(events, run: int) -> Non
     np.testing.assert_array_equal(together, rows_of(frames))
 
 
-def test_truth_and_summary_go_to_the_trace(events, tmp_path: Path) -> None:
-    trace = Log()
-    recorder = Recorder(trace)  # type: ignore[arg-type]
-    table = np.ones(3, [("position_m", float)])
-    np.save(tmp_path / "truth.npy", table)
-    recorder.obey({"command": "truth", "run": 2, "file": str(tmp_path / "truth.npy")})
-    recorder.obey({"command": "summary", "run": 2, "row": {"max": 1.0}})
-    assert trace.calls[0][:2] == ("truth", 2)
-    np.testing.assert_array_equal(trace.calls[0][2], table)
-    assert trace.calls[1] == ("summary", 2, {"max": 1.0})
-    np.save(tmp_path / "memory.npy", np.array([[0.5, 1.0]]))
-    memory = {"run": 2, "file": str(tmp_path / "memory.npy"), "decimation": 10}
-    recorder.obey({"command": "memory", **memory})
-    assert trace.calls[2] == ("memory", 2, [[0.5, 1.0]], 10)
-    Recorder().obey({"command": "summary", "run": 2, "row": {}})  # without a trace: nothing
-
-
 @given(lost=st.sets(st.integers(1, 99), max_size=40))
 def test_lost_frames_are_counted_by_message(lost: set[int]) -> None:
     frames = rows_of(Nodes().run(1, 101))
@@ -447,9 +422,10 @@ def test_two_runs_over_the_hub_with_trace(start: Start, tmp_path: Path) -> None:
             kept = np.load(tmp_path / f"frames_{run}.npy")
             np.testing.assert_array_equal(kept, rows_of(frames))
             fields = [("position_m", float), ("speed_m_s", float)]
-            np.save(tmp_path / "truth.npy", np.zeros(1500, fields))
-            tell(process, command="truth", run=run, file=str(tmp_path / "truth.npy"))
-            tell(process, command="summary", run=run, row={"max_position_error_m": 0.1})
+            truths = [np.zeros((1, 1500), fields)]
+            told = Facts(run, truths=truths, row={"max_position_error_m": 0.1})
+            facts.save(told, tmp_path / "facts.npz")
+            tell(process, command="facts", file=str(tmp_path / "facts.npz"))
     tell(process, command="stop")
     assert process.wait(30) == 0
     assert process.stderr is not None
@@ -513,7 +489,8 @@ def test_a_killed_recorder_leaves_what_it_had_logged(start: Start, tmp_path: Pat
         # Run 2 is told of only when run 1 has been logged.
         send_frames(bus, [nodes.control(RUNNING, 2)])
         assert next_event(process)["run"] == 1
-        tell(process, command="summary", run=1, row={"max_position_error_m": 0.1})
+        facts.save(Facts(1, row={"max_position_error_m": 0.1}), tmp_path / "facts.npz")
+        tell(process, command="facts", file=str(tmp_path / "facts.npz"))
         wait_for_text(tmp_path / "trace.rrd", b"max_position_error_m")
         process.kill()
         process.wait()
@@ -591,10 +568,10 @@ def test_a_command_that_fails_ends_the_recorder_with_its_trace(
     start: Start, tmp_path: Path
 ) -> None:
     process = start("--trace", str(settings_file(tmp_path / "settings.npz")))
-    tell(process, command="truth", run=1, file=str(tmp_path / "missing.npy"))
+    tell(process, command="facts", file=str(tmp_path / "missing.npz"))
     event = next_event(process)
     assert event["event"] == "error"
-    assert "missing.npy" in event["message"]
+    assert "missing.npz" in event["message"]
     assert process.wait(30) == 1
     RrdReader(str(tmp_path / "trace.rrd")).store()
 

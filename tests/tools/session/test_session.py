@@ -22,7 +22,7 @@ from rerun.chunk import RrdReader
 from ato_hil.can_dbc import rendezvous
 from ato_hil.tools.cli.options import Mode
 from ato_hil.tools.cli.run import Screen
-from ato_hil.tools.session import session
+from ato_hil.tools.session import over_bus
 from ato_hil.tools.session.processes import RunError
 from ato_hil.tools.session.replay import prepare, replay
 from ato_hil.tools.session.session import Options, SessionError, run
@@ -414,10 +414,10 @@ def test_a_bus_that_ends_while_it_is_listened_to_is_named(
         raise can.CanOperationError("the hub (process 7) is gone")
 
     leave = rendezvous.leave
-    monkeypatch.setattr(session, "recv_frames", gone)
+    monkeypatch.setattr(over_bus, "recv_frames", gone)
     name = channel(tmp_path)
     with pytest.raises(RunError, match=f"^bus {name} is gone: the hub .process 7. is gone$"):
-        session._refuse_busy_bus(name, 0.01)
+        over_bus.refuse_busy_bus(name, 0.01)
     assert os.listdir(runtime_dir / "ato-hil") == []
 
 

@@ -1,5 +1,6 @@
 """`ato-hil verify`: its fast part on every law, and that no mutation of a law gets past it."""
 
+import dataclasses
 import importlib.util
 import json
 import os
@@ -28,7 +29,7 @@ from ato_hil.tools.verify import (
     table,
 )
 
-PID = Path(registry.load_law("pid").__file__ or "")
+PID = Path(registry.load_law("pid").module.__file__ or "")
 
 
 def mutant(folder: Path, old: str, new: str) -> ModuleType:
@@ -134,7 +135,7 @@ def test_the_compiled_law_is_integers_only(law):
 
 
 def compiled_pid(module: ModuleType) -> list[str]:
-    return ir.findings(native.law(module), ("params", "inputs"))
+    return ir.findings(native.law(registry.law_of(module)), ("params", "inputs"))
 
 
 def test_a_float_is_seen_in_the_code(tmp_path):
@@ -154,7 +155,7 @@ def test_an_allocated_array_is_refused(tmp_path):
         f"{STORE}    spare = np.zeros(eps & 7, np.int64)\n    integral += spare[0]\n",
     )
     with pytest.raises(native.RefusedError, match=r"pid: the compiler refuses it: .*zeros"):
-        native.law(module)
+        native.law(registry.law_of(module))
 
 
 def test_an_exception_is_seen_in_the_code(tmp_path):
@@ -186,12 +187,14 @@ def test_no_input_makes_a_law_overflow(law):
 WORKER = """
 import importlib.util, json, sys
 import msgspec
+from controller import registry
 from ato_hil.tools.verify import overflow
 spec = importlib.util.spec_from_file_location("mutant.pid", sys.argv[1])
 module = importlib.util.module_from_spec(spec)
 sys.modules[spec.name] = module
 spec.loader.exec_module(module)
-print(msgspec.json.encode(overflow.search(module, overflow.calibrated("pid"), 800)).decode())
+report = overflow.search(registry.law_of(module), overflow.calibrated("pid"), 800)
+print(msgspec.json.encode(report).decode())
 """
 
 
@@ -240,11 +243,9 @@ def test_the_search_catches(old, new, error, tmp_path):
 
 
 def test_an_int64_field_needs_bounds():
-    class Module:
-        __file__ = str(PID)
-        STATE = np.dtype([("sum", np.int64)])
-
-    assert "STATE_BOUNDS has no bounds of sum" in overflow.state_bounds(Module)
+    wide = np.dtype([("sum", np.int64)])
+    law = dataclasses.replace(registry.load_law("pid"), STATE=wide, STATE_BOUNDS={})
+    assert "STATE_BOUNDS has no bounds of sum" in overflow.state_bounds(law)
 
 
 # Identity and the golden file.

@@ -16,10 +16,9 @@ from ato_hil.controller.laws.afilc import Gains
 from ato_hil.plant_sim.scenario import Loaded, at_rate, load
 from ato_hil.plant_sim.trains import point
 from ato_hil.tools.papers.claims import Claim, variant
-from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.frames import commanded_force_n, timetable_rate
-from ato_hil.tools.runs.result import RunResult
-from ato_hil.tools.session import sil
+from ato_hil.tools.runs.result import Run
+from ato_hil.tools.session import in_process
 
 RUNS = 100
 
@@ -73,25 +72,20 @@ def largest(runs: np.ndarray, name: str) -> float:
 
 def history(loaded: Loaded, law: str, count: int, seed: int = 1) -> np.ndarray:
     """`count` SIL runs of a scenario with a point train, (count,) of FIGURES."""
-    calibration = onboard.calibration_for(loaded, law)
-    numbers = onboard.run_numbers(law, count)
-    found = [
-        figures(loaded, result)
-        for result, _node in sil.run(loaded, calibration, runs=numbers, seed=seed)
-    ]
+    found = [figures(loaded, run) for run in in_process.runs(loaded, law, count, seed=seed)]
     return np.array(found, FIGURES)
 
 
-def figures(loaded: Loaded, result: RunResult) -> tuple[float, ...]:
+def figures(loaded: Loaded, run: Run) -> tuple[float, ...]:
     """One row of FIGURES."""
-    scenario, truth = loaded.scenario, result.truth
+    scenario, truth, frames = loaded.scenario, run.truths[0], run.frames[0]
     ticks = len(truth)
-    reference = at_rate(loaded, timetable_rate(result.frames)).profile
+    reference = at_rate(loaded, timetable_rate(frames)).profile
     e1 = reference.position_m[:ticks] - truth["position_m"]
     e2 = reference.speed_m_s[:ticks] - truth["speed_m_s"]
     window = int(scenario.metrics.to_s / scenario.period_s) + 1
     gains = gains_of(loaded)
-    force_n = commanded_force_n(result.frames, ticks)
+    force_n = commanded_force_n(frames, ticks)
     ratio = np.abs(force_n) / largest_force_n(loaded, truth["speed_m_s"])
     tail = e1[window:]
     return (
@@ -104,7 +98,7 @@ def figures(loaded: Loaded, result: RunResult) -> tuple[float, ...]:
         int((ratio > 1).sum()),
         float(np.abs(gains.psi1 * e1 + e2).max() / gains.kv),
         _rms(np.diff(force_n) / scenario.train.mass_kg),
-        len(result.faults),
+        len(run.faults[0]),
     )
 
 

@@ -17,8 +17,7 @@ import numpy as np
 
 from ato_hil.plant_sim.scenario import load, members
 from ato_hil.tools.papers.claims import Claim, variant
-from ato_hil.tools.runs import onboard, summary_row
-from ato_hil.tools.session import sil
+from ato_hil.tools.session import in_process
 
 POC, SVL, PID = "mtcc", "mtcc-single", "mtcc-pid"
 
@@ -105,9 +104,8 @@ def run(base: str, text: str = "", law: str | None = None, seed: int = 1) -> Run
     loaded = variant(base, text) if text else load(base)
     law = law or loaded.scenario.law
     trains = members(loaded)
-    nodes = onboard.controllers_for(trains, law)
-    results = next(sil.run_line(loaded, nodes, runs=range(1, 2), seed=seed))
-    truths = [result.truth for result in results]
+    made = next(in_process.runs(loaded, law, 1, seed=seed))
+    truths = made.truths
     error = np.array(
         [t["position_m"] - m.profile.position_m for t, m in zip(truths, trains, strict=True)]
     )
@@ -115,8 +113,8 @@ def run(base: str, text: str = "", law: str | None = None, seed: int = 1) -> Run
     period_s = loaded.scenario.period_s
     outside = np.flatnonzero((np.abs(error) >= 0.2).any(axis=0))
     return Run(
-        row=summary_row.row_of(trains, law, results),
-        faults={name for result in results for name in result.faults},
+        row=made.row,
+        faults={name for names in made.faults for name in names},
         least_error_m=error.min(axis=1),
         largest_error_m=error.max(axis=1),
         last_error_m=error[:, -1],

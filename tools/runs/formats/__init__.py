@@ -21,7 +21,7 @@ from ato_hil.tools.runs.formats import (
     common,
     pcapng,
 )
-from ato_hil.tools.runs.formats.common import CutOff, Damaged, Row
+from ato_hil.tools.runs.formats.common import CutOff, Row
 
 GZIP = ".gz"
 HEAD_BYTES = 512
@@ -36,7 +36,7 @@ class Format:
 
 
 class Refused(Exception):
-    """The file is empty, or of another kind than its name says."""
+    """The file is empty, or of another kind than its name says, or nothing of it can be trusted."""
 
 
 def _mf4_rows(stream: BinaryIO, head: bytes) -> Iterator[Row]:
@@ -112,7 +112,8 @@ def rows_of(path: Path) -> Iterator[Row]:
     except EOFError:
         raise CutOff("its compressed data have no end") from None
     except (zlib.error, gzip.BadGzipFile) as error:
-        raise Damaged(f"its compressed data: {error}") from None
+        # Where the damage is nobody knows: what was unpacked before it is noticed may repeat lines.
+        raise Refused(f"its compressed data are damaged: {error}") from None
 
 
 def kind_of(head: bytes) -> str:

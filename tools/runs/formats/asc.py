@@ -97,7 +97,7 @@ class _Log:
             self.open = found[1] == "begin"
         if HEADER.match(text):
             self.known = True
-        elif self._begun:
+        elif self._begun or text[0].isdigit():
             raise ValueError(f"{line[:60]!r}, expected an event")
 
     def _frame(self, words: list[str]) -> Row:
@@ -141,10 +141,11 @@ class _Log:
         if length and len(data) < length:
             raise ValueError(f"{len(data)} bytes, expected {length}")
         try:
-            classic = length and not int(more[2], 16) & FD_FRAME
+            flags = int(more[2], 16)
         except (IndexError, ValueError):
-            classic = False
-        if not classic:
+            flags = 0
+        # Some loggers leave the flags 0 for every frame.
+        if length not in range(1, 9) or flags == 0 or flags & FD_FRAME:
             return self._foreign(channel, common.FD)
         return self._data_frame(channel, words[4], self._number(rest[2], "DLC", 16), data[:8])
 

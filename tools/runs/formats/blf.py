@@ -67,7 +67,8 @@ def rows(stream: BinaryIO, _head: bytes) -> Iterator[Row]:
             yield from objects.rows(piece)
         objects.end()
     except Incomplete as error:
-        raise type(error)(f"{error} ({objects.count} of {announced} objects read)") from None
+        read = f"{objects.count} objects read, {announced} announced"
+        raise type(error)(f"{error} ({read})") from None
     if (file_bytes, announced) != (source.count, objects.count):
         raise CutOff(
             f"its header announces {announced} objects in {file_bytes} bytes, it has"

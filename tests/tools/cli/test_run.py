@@ -1,0 +1,114 @@
+"""What `run` says before, during and after: size, compilation, progress, expectations."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from ato_hil.plant_sim.scenario import load
+from ato_hil.tools.cli import console, expect, run
+from ato_hil.tools.cli.expect import ExpectError, parse, unmet
+from ato_hil.tools.cli.options import Mode
+from ato_hil.tools.session import sil
+
+ROW = {"run": 2, "max_position_error_m": 0.01, "stop_error_m": None, "faults": ["overspeed"]}
+
+
+@pytest.mark.parametrize(
+    ("text", "otherwise"),
+    [
+        ("max_position_error_m < 0.02", ""),
+        ("max_position_error_m<=1e-2", ""),
+        (" max_position_error_m  >  0.02 ", "max_position_error_m > 0.02: it is 0.01"),
+        ("max_position_error_m == 0.01", ""),
+        ("run != 2", "run != 2: it is 2"),
+        ("faults == 0", "faults == 0: it is 1"),
+        ("faults >= 1", ""),
+        ("stop_error_m < 1", "stop_error_m < 1: it has no value"),
+    ],
+)
+def test_a_row_is_held_against_what_is_expected(text: str, otherwise: str) -> None:
+    assert "; ".join(unmet([parse(text)], ROW)) == otherwise
+
+
+@pytest.mark.parametrize("text", ["", "stop_error_m", "stop_error_m < far", "< 1", "a < 1 < 2"])
+def test_what_is_no_expectation_is_refused(text: str) -> None:
+    with pytest.raises(ExpectError, match=r"^--expect .*: expected KEY < NUMBER, such as "):
+        parse(text)
+
+
+def test_a_key_that_runs_do_not_have_is_told_after_the_first() -> None:
+    with pytest.raises(ExpectError, match=r"eror_m: runs have no such .* max_position_error_m"):
+        expect.check_keys([parse("max_position_eror_m < 1")], ROW)
+
+
+def test_scripts_have_an_exit_status(ato_hil, short_text: str, tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text(short_text)
+    command = ("run", "short.toml", "--mode", "sil", "--no-trace", "--expect", "faults == 0")
+    done = ato_hil(*command, "--expect", "max_position_error_m < 1e-6", cwd=tmp_path)
+    assert done.returncode == console.EXIT_NOT_AS_EXPECTED
+    assert done.stderr.startswith("ato-hil: max_position_error_m < 1e-06: it is ")
+    assert "faults" not in done.stderr  # which is as expected
+    assert "\ndigest  " in done.stdout
+
+
+@pytest.fixture
+def screen(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    file = io.StringIO()
+    monkeypatch.setattr(console, "console", Console(width=80, file=file))
+    return file
+
+
+def test_a_gigabyte_is_announced(screen: io.StringIO) -> None:
+    loaded = load("subway")
+    for runs, said in ((range(1, 11), False), (range(1, 101), True)):
+        run.Screen(Mode.sil, bytes_per_tick=run.BYTES_OF_TRACE).begin(loaded, "cailc", runs)
+        assert ("this will write about 1.2 GB" in screen.getvalue()) is said
+    run.Screen(Mode.sil).begin(loaded, "cailc", range(1, 4096))
+    assert screen.getvalue().count("GB") == 1
+
+
+def test_the_first_compilation_is_announced(
+    screen: io.StringIO, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    console.say_if_compiling()
+    assert "the steps are compiled now" in screen.getvalue()
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / "step.nbi").touch()
+    console.say_if_compiling()
+    assert screen.getvalue().count("\n") == 1
+
+
+def test_the_interpreted_loop_says_where_it_is() -> None:
+    said: list[int] = []
+    sensed: list[tuple[object, ...]] = []
+    sense = sil._watched(lambda *arguments: sensed.append(arguments), said.append)
+    for tick in range(250):
+        sense("params", "limits", "state", "chance", tick, "mailboxes")
+    assert said == [0, 100, 200]
+    assert sensed[249] == ("params", "limits", "state", "chance", 249, "mailboxes")
+
+
+def test_clean_takes_what_can_be_made_again(ato_hil, tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    (cache / "ato-hil" / "old").mkdir(parents=True)
+    (cache / "ato-hil" / "old" / "step.nbi").write_text("x")
+    (cache / "others").mkdir()
+    for name, file in (("session", "summary.json"), ("mine", "notes.txt")):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / file).write_text("x")
+    here = {"cwd": tmp_path, "XDG_CACHE_HOME": str(cache), "NUMBA_CACHE_DIR": ""}
+    done = ato_hil("clean", **here)
+    assert done.returncode == 0, done.stderr
+    assert not (cache / "ato-hil").exists()
+    assert (tmp_path / "runs" / "session").exists()
+    done = ato_hil("clean", "--runs", **here)
+    assert done.stdout == "removed runs/session   0.0 MB\n"
+    assert (tmp_path / "runs" / "mine" / "notes.txt").exists()
+    assert (cache / "others").exists()
+    done = ato_hil("clean", cwd=tmp_path, NUMBA_CACHE_DIR=str(cache))
+    assert "left alone" in done.stdout
