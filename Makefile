@@ -19,7 +19,7 @@ DEV_READY := .venv/dev.ready
 COMPILE := .venv/bin/python -m uv pip compile pyproject.toml --universal --generate-hashes --group build \
 	--no-header --no-annotate --no-emit-index-url --quiet
 
-.PHONY: help hil test long test-socketcan verify golden pareto figures pictures claims docs lint types lock clean
+.PHONY: help hil test long test-socketcan pil verify golden pareto figures pictures claims docs lint types lock clean
 
 help: ## list the targets
 	sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 23
@@ -40,11 +40,17 @@ long: $(DEV_READY) ## pass the long tests
 test-socketcan: $(DEV_READY) ## pass the tests on SocketCAN, in user-mode Linux, and measure it there
 	$(install_guest)
 	.venv/bin/ato-hil run tests/uml/short.toml --bus hub:uml --out runs/test-socketcan --overwrite
+	.venv/bin/ato-hil export c tests/uml/short.toml --out runs/test-socketcan/ato
+	$(MAKE) -s -C examples/linux_can EXPORT="$(CURDIR)/runs/test-socketcan/ato" OUT="$(CURDIR)/runs/test-socketcan"
 	.venv/bin/python tests/python_can_tests.py runs/test-socketcan
 	.venv/bin/python tests/uml/guest.py --limit $(GUEST_LIMIT_S) \
 		.venv/bin/python -m pytest -v -p no:cacheprovider -m uml $(PYTEST_ARGS) tests/uml
 	.venv/bin/python tests/uml/guest.py --limit $(GUEST_LIMIT_S) .venv/bin/ato-hil bench \
 		--no-sessions --bus socketcan:vcan0 --bus vcan --bus hub:uml
+
+pil: $(DEV_READY) ## pass the tests on emulated microcontrollers; the golden runs among them take an hour
+	$(install_emulator)
+	.venv/bin/python -m pytest -n 2 -q -rs -m pil $(PYTEST_ARGS)
 
 verify: $(RUN_READY) ## check every promise of the firmware: LAWS="cailc pid", all by default
 	.venv/bin/ato-hil verify $(LAWS)
@@ -134,15 +140,26 @@ $(DEV_READY): pyproject.toml requirements-dev.lock
 	$(call set_up,requirements-dev.lock)
 	touch $(RUN_READY) $@
 
+define install_emulator
+missing=
+command -v qemu-system-arm >/dev/null || missing+=" qemu-system-arm"
+command -v arm-none-eabi-gcc >/dev/null || missing+=" gcc-arm-none-eabi"
+$(call install_missing)
+endef
+
 define install_guest
 missing=
 command -v linux.uml >/dev/null || missing+=" user-mode-linux"
 PATH=$$PATH:/usr/sbin:/sbin command -v insmod >/dev/null || missing+=" kmod"
 PATH=$$PATH:/usr/sbin:/sbin command -v ip >/dev/null || missing+=" iproute2"
 echo "#include <elf.h>" | gcc -E - >/dev/null 2>&1 || missing+=" gcc libc6-dev"
+$(call install_missing, (on x86-64 only))
+endef
+
+define install_missing
 if [ -n "$$missing" ]; then
 	if [ "$$(id -u)" != 0 ] || ! command -v apt-get >/dev/null; then
-		echo "Packages of Debian are missing (on x86-64 only). Install them, then run make again:" \
+		echo "Packages of Debian are missing$(1). Install them, then run make again:" \
 			"sudo apt-get install -y$$missing" >&2
 		exit 1
 	fi

@@ -19,6 +19,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from ato_hil.can_dbc import step
+from ato_hil.can_dbc.errors import InputError
 from ato_hil.controller import firmware
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.registry import is_file, law_label, load_law
@@ -27,7 +28,7 @@ FORMAT = 1
 TEXT = 64  # bytes of a text in the library's information
 
 
-class LibraryError(ValueError):
+class LibraryError(InputError):
     """The file is no firmware, or one for something else; one line."""
 
 
@@ -76,8 +77,8 @@ def load(path: Path, calibration: Calibration) -> Any:
     return _tick(name)
 
 
-def _compare(path: Path, library: Any, found: Information, calibration: Calibration) -> None:
-    """Raises LibraryError if the library is for something else."""
+def compare_information(path: Path, found: Information, calibration: Calibration) -> None:
+    """Raises LibraryError if what `path` says of itself is not what the calibration is for."""
     state = firmware.state_dtype(load_law(calibration.law).STATE)
     for what, has, expected in (
         ("format", found.format, FORMAT),
@@ -90,7 +91,12 @@ def _compare(path: Path, library: Any, found: Information, calibration: Calibrat
         ("timetable", found.segments, len(calibration.profile)),
     ):
         if has != expected:
-            raise LibraryError(f"{path}: a library of {what} {has}, expected {expected}")
+            raise LibraryError(f"{path}: made for {what} {has}, expected {expected}")
+
+
+def _compare(path: Path, library: Any, found: Information, calibration: Calibration) -> None:
+    """Raises LibraryError if the library is for something else."""
+    compare_information(path, found, calibration)
     size = found.trains * found.params_size
     params = bytes((ctypes.c_char * size).in_dll(library, "ATO_PARAMS"))
     ours = calibration.params.tobytes()

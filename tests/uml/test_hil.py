@@ -30,7 +30,7 @@ def run(folder: Path, *arguments: str, before: tuple[str, ...] = (), **environme
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "missed" not in done.stdout, done.stdout
+    assert "the recorder missed" not in done.stdout, done.stdout
     (summary,) = folder.glob("runs/*/summary.json")
     return json.loads(summary.read_text())
 

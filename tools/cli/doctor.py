@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,7 @@ def examine() -> list[Finding]:
         _private_vcan(),
         _viewer(),
         _pictures(),
+        _microcontroller(),
     ]
 
 
@@ -172,3 +174,15 @@ def _pictures() -> Finding:
             " apt-get install mesa-vulkan-drivers",
         )
     return Finding("pictures of the viewer", "works", "`view --screenshot` can draw")
+
+
+def _microcontroller() -> Finding:
+    from ato_hil.tools.export import image
+    from ato_hil.tools.session import pil
+
+    tools = {pil.EMULATOR: "qemu-system-arm", image.COMPILER: "gcc-arm-none-eabi"}
+    missing = [package for program, package in tools.items() if shutil.which(program) is None]
+    if missing:
+        text = f"for `--mode pil`: apt-get install {' '.join(missing)}"
+        return Finding("microcontroller", "absent", text)
+    return Finding("microcontroller", "works", "emulator and compiler for `--mode pil`")

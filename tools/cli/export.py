@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from ato_hil.tools.cli.console import one_line_for_bad_input, say
+from ato_hil.tools.cli.options import DEFAULT_BOARD, BoardName
+from ato_hil.tools.session import boards
 
 app = typer.Typer(help="The firmware for other tools and targets.", no_args_is_help=True)
 
@@ -36,3 +38,22 @@ def c_command(
         folder.write(made, out)
     lines = sum(text.count("\n") for text in made.values())
     say(f"{out}: {len(made)} files, {lines} lines; the manual is {out / 'ato.h'}")
+
+
+def image_command(
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario (`ato-hil list`) or a .toml file.")
+    ],
+    out: Annotated[Path, typer.Option(help="ELF file to write.")],
+    law: Annotated[
+        str | None, typer.Option(help="Control law, or its .py file; the scenario's by default.")
+    ] = None,
+    board: Annotated[BoardName, typer.Option(help="The microcontroller.")] = DEFAULT_BOARD,
+) -> None:
+    """The same for a microcontroller, to be run with `ato-hil run --mode pil --firmware FILE`."""
+    with one_line_for_bad_input():
+        from ato_hil.plant_sim.scenario import load
+        from ato_hil.tools.export import image
+
+        image.build(load(scenario), law, boards.board_of(board.value), out)
+    say(f"{out}: {boards.BOARDS[board.value].about}")

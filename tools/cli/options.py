@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from ato_hil.tools.session import boards
+
 
 class Mode(StrEnum):
     """Where the controller runs."""
@@ -15,6 +17,7 @@ class Mode(StrEnum):
     hil = "hil"
     sil = "sil"
     mil = "mil"
+    pil = "pil"
 
 
 class External(StrEnum):
@@ -45,6 +48,10 @@ class Picture(StrEnum):
     svg = "svg"
     pdf = "pdf"
 
+
+# A microcontroller's board.
+BoardName = StrEnum("BoardName", {name: name for name in boards.BOARDS})  # type: ignore[misc]
+DEFAULT_BOARD = BoardName(boards.DEFAULT)
 
 ScenarioName = Annotated[
     str, typer.Argument(metavar="SCENARIO", help="Name of a scenario or a .toml file.")

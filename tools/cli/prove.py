@@ -147,8 +147,8 @@ def threats(
     from ato_hil.tools.campaigns import undetected
     from ato_hil.tools.session.processes import RunError
 
-    if mode is Mode.mil:
-        raise fail("threats: mode is mil, expected sil or hil", EXIT_BAD_INPUT)
+    if mode not in (Mode.sil, Mode.hil):
+        raise fail(f"threats: mode is {mode.value}, expected sil or hil", EXIT_BAD_INPUT)
     least = frames or (1_000_000 if mode is Mode.sil else 100_000)
     say(
         f"{least:,} frames or more, and {RESIDUAL_FRAMES:,} corrupt ones: this takes minutes", "dim"

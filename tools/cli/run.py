@@ -25,9 +25,21 @@ from ato_hil.tools.cli.console import (
     sigterm_as_ctrl_c,
 )
 from ato_hil.tools.cli.expect import Expectation, check_keys, parse, unmet
-from ato_hil.tools.cli.options import External, LawName, Mode, Overwrite, Pace, Runs, Seed, Viewer
+from ato_hil.tools.cli.options import (
+    DEFAULT_BOARD,
+    BoardName,
+    External,
+    LawName,
+    Mode,
+    Overwrite,
+    Pace,
+    Runs,
+    Seed,
+    Viewer,
+)
 from ato_hil.tools.cli.output import console
 from ato_hil.tools.cli.tables import Column, Row, show
+from ato_hil.tools.session import boards
 from ato_hil.tools.trace.live_viewer import LiveView
 
 if TYPE_CHECKING:
@@ -143,7 +155,8 @@ def run(
     mode: Annotated[
         Mode,
         typer.Option(
-            help="hil: processes on a bus; sil: one compiled loop; mil: interpreted, checked."
+            help="hil: processes on a bus; sil: one compiled loop; mil: interpreted, checked;"
+            " pil: on an emulated microcontroller."
         ),
     ] = Mode.hil,
     bus: Annotated[
@@ -201,8 +214,12 @@ def run(
     ] = None,
     firmware: Annotated[
         Path | None,
-        typer.Option(help="Library of `ato-hil export c` in place of the compiled Python."),
+        typer.Option(
+            help="Library of `ato-hil export c` in place of the compiled Python; PIL: image of"
+            " `ato-hil export image`, which is made if none is named."
+        ),
     ] = None,
+    board: Annotated[BoardName, typer.Option(help="PIL: the microcontroller.")] = DEFAULT_BOARD,
     view: Annotated[
         Viewer | None,
         typer.Option(
@@ -222,6 +239,13 @@ def run(
             if not trace:
                 raise fail("--view shows the trace, so not with --no-trace", EXIT_BAD_INPUT)
             viewer = stack.enter_context(LiveView(view.value))
+        if mode is Mode.pil and firmware is None:
+            from ato_hil.plant_sim.scenario import load
+            from ato_hil.tools.export import image
+
+            firmware = stack.enter_context(
+                image.built(load(scenario), law, boards.board_of(board.value))
+            )
         with (
             places.folder(out, _name(scenario, law, mode, nodes), overwrite) as place,
             places.recording(record, overwrite) as recorded,
@@ -243,6 +267,7 @@ def run(
                 spin_us=spin_us,
                 viewer=viewer,
                 firmware=firmware,
+                board=board.value,
             )
             size = BYTES_OF_TRACE * trace + BYTES_OF_RECORDING * (record is not None)
             summary = _run(options, Screen(mode, expected, size))
@@ -294,6 +319,8 @@ def _print_end(summary: dict[str, Any], options: Options) -> None:
     folder = options.out
     if External.plant in options.external:
         say("errors and energy are what the bus shows: measured, commanded")
+    if "target" in summary:
+        _print_target(summary["target"])
     if "timing" in summary:
         _print_timing(summary["timing"])
     repeats = "" if summary["digest_repeats"] else "   (in real time another one each time)"
@@ -318,6 +345,13 @@ def _wait_for(viewer: LiveView | None) -> None:
     if viewer is not None:
         with suppress(KeyboardInterrupt):
             viewer.wait()
+
+
+def _print_target(target: dict[str, Any]) -> None:
+    say(
+        f"board   {target['board']}, code for {target['core']}; a control period takes at most"
+        f" {target['instructions_most']} instructions, the stack {target['stack_bytes']} bytes"
+    )
 
 
 def _print_timing(timing: dict[str, Any]) -> None:

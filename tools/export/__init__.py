@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+from ato_hil.can_dbc.errors import InputError
 
-class ExportError(ValueError):
+
+class ExportError(InputError):
     """What cannot be exported; one line, with file and line where there is one."""

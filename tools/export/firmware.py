@@ -300,9 +300,11 @@ def tables(program: Program) -> Iterator[str]:
 
 
 def frame_ids() -> str:
-    """The identifiers by mailbox."""
+    """The identifiers, and the Data-IDs of the end-to-end protection, by mailbox."""
     ids = ", ".join(f"0x{message.frame_id:x}" for message in MESSAGES)
     lines = wrapped("", f"const int32_t ATO_FRAME_ID[ATO_MESSAGE_COUNT] = {{ {ids} }};")
+    ids = ", ".join(f"0x{message.data_id:x}" for message in MESSAGES)
+    lines += wrapped("", f"const uint16_t ATO_DATA_ID[ATO_MESSAGE_COUNT] = {{ {ids} }};")
     return "\n".join(lines) + "\n"
 
 
@@ -520,6 +522,8 @@ def can_file(made: Firmware) -> str:
     lines += [
         "/* Identifiers by mailbox. */",
         "extern const int32_t ATO_FRAME_ID[ATO_MESSAGE_COUNT];",
+        "/* Data-IDs of AUTOSAR's end-to-end protection, Profile 11, by mailbox. */",
+        "extern const uint16_t ATO_DATA_ID[ATO_MESSAGE_COUNT];",
         "",
         "#endif",
     ]

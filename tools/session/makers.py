@@ -17,7 +17,7 @@ from ato_hil.controller import node, store
 from ato_hil.controller.node import Controller
 from ato_hil.tools.runs.can_logs import Recording
 from ato_hil.tools.runs.result import Run
-from ato_hil.tools.session import in_process, processes
+from ato_hil.tools.session import boards, in_process, pil, processes
 from ato_hil.tools.session.options import Listener, Setup
 from ato_hil.tools.trace import facts
 from ato_hil.tools.trace.writer import TraceWriter
@@ -94,6 +94,25 @@ class InProcess:
             progress=self.listener.progress,
         ):
             yield replace(run, memory=setup.learned(learned_by(nodes[0]))) if setup.words else run
+
+
+class OnTarget(InProcess):
+    """The same with the controllers on emulated boards."""
+
+    def _made(self) -> Generator[Run, None, None]:
+        setup, options = self.setup, self.setup.options
+        assert options.firmware is not None  # options.check refuses that
+        self.about["controller"] = sizes(node.build(setup.calibrations[0]))
+        board = boards.board_of(options.board)
+        with pil.targets(options.firmware, board, setup.calibrations) as started:
+            for run in pil.run_line(
+                *(setup.loaded, setup.law, started),
+                runs=setup.runs,
+                seed=options.seed,
+                progress=self.listener.progress,
+            ):
+                self.about["target"] = pil.about(started, board)
+                yield run
 
 
 class Interpreted(InProcess):

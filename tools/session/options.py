@@ -19,12 +19,12 @@ from ato_hil.plant_sim import failures
 from ato_hil.plant_sim.scenario import Loaded, load, members
 from ato_hil.tools.runs import can_logs, onboard
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
-from ato_hil.tools.session import processes
+from ato_hil.tools.session import boards, processes
 from ato_hil.tools.session.external_nodes import CONTROLLER, PLANT
 from ato_hil.tools.trace.live_viewer import LiveView
 
 RUNS_MAX = 4095  # Iteration has 12 bits
-MODES = ("hil", "sil", "mil")
+MODES = ("hil", "sil", "mil", "pil")
 LOCKSTEP, REALTIME = "lockstep", "realtime"
 
 
@@ -64,7 +64,7 @@ class Options:
     scenario: str
     law: str | None
     runs: int | None
-    mode: str  # hil | sil | mil
+    mode: str  # hil | sil | mil | pil
     bus: str
     seed: int
     out: Path
@@ -76,7 +76,8 @@ class Options:
     pace: str = LOCKSTEP
     spin_us: int = 0  # real time: busy wait of the plant before each deadline
     viewer: LiveView | None = None  # that looks on
-    firmware: Path | None = None  # library in place of the controller's compiled steps
+    firmware: Path | None = None  # library in place of the controller's compiled steps; PIL: image
+    board: str = boards.DEFAULT  # of PIL
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class Setup:
     def words(self) -> tuple[str, ...]:
         """Names of the words of the learning memory, where it can be had: it is not on the bus."""
         in_processes = self.options.mode == "hil" and self.options.memory is None
-        if len(self.calibrations) != 1 or in_processes:
+        if len(self.calibrations) != 1 or in_processes or self.options.mode == "pil":
             return ()
         stored = int(self.calibrations[0].params[0]["memory"]["words"])
         return tuple(f"{name} [{unit}]" for name, unit, _q in load_law(self.law).WORDS[:stored])
@@ -207,7 +208,13 @@ def _controllers(options: Options, trains: list[Loaded]) -> tuple[str, list[Cali
     law = options.law or loaded.scenario.law
     load_law(law)
     calibrations = [onboard.calibration_for(train, law) for train in trains]
-    if options.firmware is not None:
+    if options.mode == "pil":
+        boards.board_of(options.board)
+        if options.firmware is None:
+            raise SessionError("mode pil needs an image of the firmware, as `export image` makes")
+        if options.memory is not None:
+            raise SessionError("mode pil takes no memory file: the image has its own memory")
+    elif options.firmware is not None:
         if options.mode == "mil":
             raise SessionError(f"{options.firmware}: a library needs mode sil or hil, this is mil")
         for calibration in calibrations:
@@ -220,8 +227,8 @@ def _faults(options: Options, file: Path, loaded: Loaded) -> Faults:
     """The faults that are asked for. Raises FaultError, SessionError."""
     if options.external:
         raise SessionError(f"{file}: faults are injected in nodes of ours, not in an external one")
-    if options.mode == "mil":
-        raise SessionError(f"{file}: faults need mode sil or hil, this is mil")
+    if options.mode not in ("sil", "hil"):
+        raise SessionError(f"{file}: faults need mode sil or hil, this is {options.mode}")
     asked = Faults(
         file,
         faults.load(file, options.seed, loaded.scenario.period_s),

@@ -1,7 +1,8 @@
 """One session: the runs of one scenario and law in one mode, with their trace and summary.
 
 Modes: `sil` (one compiled loop), `mil` (the same loop interpreted, in a child process where this
-one compiles), `hil` (three processes on a bus). All give the same digest. In HIL
+one compiles), `hil` (three processes on a bus), `pil` (the firmware's image on an emulated
+microcontroller). All give the same digest. In HIL
 plant or controller, or both, may be external: started by their owner, known by their frames alone.
 Only HIL can also go by the clock, pace `realtime`: its digest depends on what was in time.
 """
@@ -24,7 +25,7 @@ from ato_hil.tools.runs import can_logs, environment
 from ato_hil.tools.runs.files import write_json, write_text
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
 from ato_hil.tools.runs.result import Run
-from ato_hil.tools.session.makers import InProcess, Interpreted, Maker
+from ato_hil.tools.session.makers import InProcess, Interpreted, Maker, OnTarget
 from ato_hil.tools.session.options import (
     LOCKSTEP,
     RUNS_MAX,
@@ -136,6 +137,8 @@ class Session:
             return OverBus(self.setup, self.listener)
         if self.setup.options.mode == "mil" and not INTERPRETED:
             return Interpreted(self.setup, self.listener)
+        if self.setup.options.mode == "pil":
+            return OnTarget(self.setup, self.listener)
         return InProcess(self.setup, self.listener)
 
     def _finish_run(self, run: Run, maker: Maker, recording: can_logs.Recording | None) -> None:
