@@ -145,6 +145,7 @@ def threats(
     came of it."""
     from ato_hil.tools.campaigns import threats as campaign
     from ato_hil.tools.campaigns import undetected
+    from ato_hil.tools.runs import locks
     from ato_hil.tools.session.processes import RunError
 
     if mode is Mode.mil:
@@ -158,6 +159,7 @@ def threats(
             one_line_for_bad_input(),
             sigterm_as_ctrl_c(),
             places.folder(out, "threats", overwrite) as place,
+            locks.folder_held(place.work),
             working("compiling ...") as update,
         ):
             rates = undetected.measure(RESIDUAL_FRAMES, seed)
@@ -277,7 +279,7 @@ def endurance(
 ) -> None:
     """Kill and stop nodes of sessions at random moments: each has to end named and clean."""
     from ato_hil.tools.campaigns import endurance as trials
-    from ato_hil.tools.runs import files
+    from ato_hil.tools.runs import files, locks
 
     say(f"{times} sessions, some seconds each", "dim")
     done: list[Outcome] = []
@@ -285,6 +287,7 @@ def endurance(
         one_line_for_bad_input(),
         sigterm_as_ctrl_c(),
         places.folder(out, "endurance", overwrite) as place,
+        locks.folder_held(place.work),
     ):
         with working("") as update, suppress(KeyboardInterrupt):  # what was done counts
             for outcome in trials.campaign(trials.plan(times, seed), place.work):

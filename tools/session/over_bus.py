@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Generator
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from ato_hil.can_dbc import faults
 from ato_hil.can_dbc.bus import choose_bus, open_bus, recv_frames
 from ato_hil.controller import store
 from ato_hil.controller.interface import fault_names
+from ato_hil.tools.runs import locks
 from ato_hil.tools.runs.can_logs import Recording
 from ato_hil.tools.runs.result import Run
 from ato_hil.tools.session import processes, realtime
@@ -36,8 +37,9 @@ BUSY_S = 0.3  # how long to listen for other traffic, on all buses together
 class OverBus:
     """The runs of one session."""
 
-    def __init__(self, setup: Setup, listener: Listener) -> None:
-        """Raises BusError or SessionError if there is no such bus, or it cannot be used."""
+    def __init__(self, setup: Setup, listener: Listener, held: ExitStack) -> None:
+        """Raises BusError, LockedError or SessionError if there is no such bus, or it cannot be
+        used; `held` gets the locks of the buses."""
         self.setup, self.listener = setup, listener
         self.recording: Recording | None = None
         self.us_per_frame: float | None = None  # that the trace has taken
@@ -55,6 +57,8 @@ class OverBus:
         self._buses = buses = line_buses(choice.name, len(setup.members))
         through = f" to {buses[-1]}" if len(buses) > 1 else ""
         listener.note(f"bus {buses[0]}{through}: {choice.reason}")
+        ours = {PLANT, CONTROLLER} - set(options.external)
+        held.enter_context(locks.buses_held(buses, sorted(ours)))
         if PLANT not in options.external:  # which may well be there, and announce itself
             for bus in buses:
                 refuse_busy_bus(bus, BUSY_S / len(buses))

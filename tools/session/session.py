@@ -20,7 +20,7 @@ from ato_hil.can_dbc import faults
 from ato_hil.can_dbc.step import INTERPRETED
 from ato_hil.controller.registry import is_file
 from ato_hil.plant_sim.scenario import FOLDER
-from ato_hil.tools.runs import can_logs, environment
+from ato_hil.tools.runs import can_logs, environment, locks
 from ato_hil.tools.runs.files import write_json, write_text
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
 from ato_hil.tools.runs.result import Run
@@ -59,8 +59,9 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     """Runs the session; returns and writes the summary.
 
     Raises ScenarioError, LawError, CalibrationError, BusError, MemoryFileError, RecordError,
-    FaultError, SessionError for bad input, RunError if a run ends early (the summary then holds the
-    runs that were completed and the reason), KeyboardInterrupt likewise.
+    FaultError, SessionError for bad input, LockedError for what another session has, RunError if a
+    run ends early (the summary then holds the runs that were completed and the reason),
+    KeyboardInterrupt likewise.
     """
     session = begin(options, listener)
     with closing(session.runs()) as runs:
@@ -71,18 +72,23 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
 
 def begin(options: Options, listener: Listener) -> Session:
     """A session whose input is good, with its folder. Raises as `run`, for bad input."""
-    setup = check(options)
-    prepare(options.out)
-    listener.begin(setup.loaded, setup.law, setup.runs)
-    return Session(setup, listener)
+    with ExitStack() as held:
+        setup = check(options, held)
+        held.enter_context(locks.folder_held(options.out))
+        prepare(options.out)
+        listener.begin(setup.loaded, setup.law, setup.runs)
+        for text in setup.notes:
+            listener.note(text)
+        return Session(setup, listener, held.pop_all())
 
 
 class Session:
-    """A session under way; `summary` is what summary.json holds."""
+    """A session under way; `summary` is what summary.json holds, `held` what no other session may
+    have until the runs are made, or it is closed."""
 
-    def __init__(self, setup: Setup, listener: Listener) -> None:
+    def __init__(self, setup: Setup, listener: Listener, held: ExitStack) -> None:
         options, loaded = setup.options, setup.loaded
-        self.setup, self.listener = setup, listener
+        self.setup, self.listener, self.held = setup, listener, held
         self._injected: list[faults.Event] = []
         self.summary: dict[str, Any] = {
             "schema": SCHEMA,
@@ -109,6 +115,10 @@ class Session:
     def runs(self) -> Generator[Run, None, None]:
         """Makes the runs, each when it is asked for; whatever ends the iteration ends the session
         and writes its summary. Raises as `run`."""
+        with self.held:
+            yield from self._runs()
+
+    def _runs(self) -> Generator[Run, None, None]:
         maker: Maker | None = None
         try:
             with ExitStack() as stack:
@@ -129,11 +139,12 @@ class Session:
                 self.summary["ended_early"] = "the rest was not asked for"
             raise
         finally:
-            self._conclude(maker)
+            if maker is not None:  # else there was nothing to begin with
+                self._conclude(maker)
 
     def _maker(self) -> Maker:
         if self.setup.options.mode == "hil":
-            return OverBus(self.setup, self.listener)
+            return OverBus(self.setup, self.listener, self.held)
         if self.setup.options.mode == "mil" and not INTERPRETED:
             return Interpreted(self.setup, self.listener)
         return InProcess(self.setup, self.listener)
@@ -157,21 +168,20 @@ class Session:
         self.summary["runs"].append(row)
         self.listener.row(row)
 
-    def _conclude(self, maker: Maker | None) -> None:
+    def _conclude(self, maker: Maker) -> None:
         """Write the summary."""
         out = self.setup.options.out
-        if maker is not None:
-            self.summary |= maker.about
-            if maker.injected is not None:
-                self._injected = maker.injected
-                self._save_injected()
-            if maker.timing is not None:
-                self.summary["timing"] = maker.timing
-            if maker.us_per_frame is not None:
-                self.summary["trace"] = {
-                    "bytes": (out / "trace.rrd").stat().st_size,
-                    "us_per_frame": maker.us_per_frame,
-                }
+        self.summary |= maker.about
+        if maker.injected is not None:
+            self._injected = maker.injected
+            self._save_injected()
+        if maker.timing is not None:
+            self.summary["timing"] = maker.timing
+        if maker.us_per_frame is not None:
+            self.summary["trace"] = {
+                "bytes": (out / "trace.rrd").stat().st_size,
+                "us_per_frame": maker.us_per_frame,
+            }
         write_json(out / "summary.json", self.summary)
 
     def _save_injected(self) -> None:
