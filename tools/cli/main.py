@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from ato_hil.tools.cli import buses, clean, compare, export, look, prove, run
+from ato_hil.tools.cli.console import end_as_with_ctrl_c
 from ato_hil.tools.cli.options import Viewer
 from ato_hil.tools.cli.output import ignore_other_tools, streams
 
@@ -82,6 +83,7 @@ def main() -> None:
         if word == "--view" and sys.argv[at + 1 : at + 2] not in (["web"], ["native"]):
             sys.argv[at] = f"--view={Viewer.native.value}"
     ignore_other_tools()
+    end_as_with_ctrl_c()
     with streams():
         app()
 

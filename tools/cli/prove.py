@@ -17,7 +17,6 @@ from ato_hil.tools.cli.console import (
     fail,
     one_line_for_bad_input,
     say,
-    sigterm_as_ctrl_c,
     working,
 )
 from ato_hil.tools.cli.options import Mode, Overwrite
@@ -157,7 +156,6 @@ def threats(
     try:
         with (
             one_line_for_bad_input(),
-            sigterm_as_ctrl_c(),
             places.folder(out, "threats", overwrite) as place,
             locks.folder_held(place.work),
             working("compiling ...") as update,
@@ -235,7 +233,6 @@ def noise(
     try:
         with (
             one_line_for_bad_input(),
-            sigterm_as_ctrl_c(),
             working("compiling ...") as update,
         ):
             found = flood.beside(scenario, law, frames, seed, bus, update)
@@ -285,7 +282,6 @@ def endurance(
     done: list[Outcome] = []
     with (
         one_line_for_bad_input(),
-        sigterm_as_ctrl_c(),
         places.folder(out, "endurance", overwrite) as place,
         locks.folder_held(place.work),
     ):

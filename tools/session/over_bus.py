@@ -26,6 +26,7 @@ from ato_hil.tools.session.external_nodes import (
     PLANT,
     measured_truth,
 )
+from ato_hil.tools.session.interrupts import Interrupts
 from ato_hil.tools.session.options import REALTIME, Listener, SessionError, Setup
 from ato_hil.tools.session.processes import Bench, RunError
 from ato_hil.tools.session.recorder import frames_folder, save_settings
@@ -37,16 +38,19 @@ BUSY_S = 0.3  # how long to listen for other traffic, on all buses together
 class OverBus:
     """The runs of one session."""
 
-    def __init__(self, setup: Setup, listener: Listener, held: ExitStack) -> None:
+    def __init__(
+        self, setup: Setup, listener: Listener, held: ExitStack, interrupts: Interrupts
+    ) -> None:
         """Raises BusError, LockedError or SessionError if there is no such bus, or it cannot be
         used; `held` gets the locks of the buses."""
-        self.setup, self.listener = setup, listener
+        self.setup, self.listener, self.interrupts = setup, listener, interrupts
         self.recording: Recording | None = None
         self.us_per_frame: float | None = None  # that the trace has taken
         self.injected: list[faults.Event] | None = None  # faults, once all is over
         self._recorder: processes.Node | None = None
         self._kept = Path()  # files on their way
         self._account: realtime.Account | None = None
+        self._asleep_s = 0.0  # that this process is known to have been suspended
         options = setup.options
         choice = choose_bus(options.bus)
         if choice.interface == "virtual":
@@ -97,10 +101,12 @@ class OverBus:
                 signals=setup.faults.processes if setup.faults is not None else [],
                 real_time=real_time,
                 linger=options.viewer is not None,
+                interrupts=self.interrupts,
             )
             try:
                 with closing(events):
                     for speaker, event, bench in events:
+                        self._say_if_suspended(bench)
                         run = self._on_event(bench, speaker.name, event)
                         if run is not None:
                             yield run
@@ -156,6 +162,14 @@ class OverBus:
             if led is not None and bench.over(event["run"]):
                 return self._run(bench, led, bench.nodes["recorder"].runs[event["run"]])
         return None
+
+    def _say_if_suspended(self, bench: Bench) -> None:
+        """In lockstep nothing comes of it."""
+        slept_s, self._asleep_s = bench.asleep_s - self._asleep_s, bench.asleep_s
+        if slept_s and self._account is not None:
+            self.listener.note(
+                f"this process was suspended for {slept_s:.0f} s; the run went on by the clock"
+            )
 
     def _run(self, bench: Bench, led: dict[str, Any], heard: dict[str, Any]) -> Run:
         """A run that the node that leads the runs, and the recorder, have both finished."""

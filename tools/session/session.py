@@ -24,6 +24,7 @@ from ato_hil.tools.runs import can_logs, environment, locks
 from ato_hil.tools.runs.files import write_json, write_text
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
 from ato_hil.tools.runs.result import Run
+from ato_hil.tools.session.interrupts import Interrupts
 from ato_hil.tools.session.makers import InProcess, Interpreted, Maker
 from ato_hil.tools.session.options import (
     LOCKSTEP,
@@ -64,9 +65,7 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     KeyboardInterrupt likewise.
     """
     session = begin(options, listener)
-    with closing(session.runs()) as runs:
-        for _run in runs:
-            pass
+    session.complete()
     return session.summary
 
 
@@ -115,14 +114,23 @@ class Session:
     def runs(self) -> Generator[Run, None, None]:
         """Makes the runs, each when it is asked for; whatever ends the iteration ends the session
         and writes its summary. Raises as `run`."""
-        with self.held:
-            yield from self._runs()
+        interrupts = Interrupts()
+        with self.held, interrupts, closing(self._runs(interrupts)) as made:
+            for run in made:
+                with interrupts.let_through():
+                    yield run
 
-    def _runs(self) -> Generator[Run, None, None]:
+    def complete(self) -> None:
+        """Makes all runs. Raises as `run`."""
+        with self.held, Interrupts() as interrupts:
+            for _run in self._runs(interrupts):
+                pass
+
+    def _runs(self, interrupts: Interrupts) -> Generator[Run, None, None]:
         maker: Maker | None = None
         try:
             with ExitStack() as stack:
-                maker = self._maker()  # before the recording: there may be no such bus
+                maker = self._maker(interrupts)  # before the recording: there may be no such bus
                 recording = stack.enter_context(self._recording())
                 made = stack.enter_context(closing(maker.runs(recording)))
                 for run in made:
@@ -142,12 +150,12 @@ class Session:
             if maker is not None:  # else there was nothing to begin with
                 self._conclude(maker)
 
-    def _maker(self) -> Maker:
+    def _maker(self, interrupts: Interrupts) -> Maker:
         if self.setup.options.mode == "hil":
-            return OverBus(self.setup, self.listener, self.held)
+            return OverBus(self.setup, self.listener, self.held, interrupts)
         if self.setup.options.mode == "mil" and not INTERPRETED:
-            return Interpreted(self.setup, self.listener)
-        return InProcess(self.setup, self.listener)
+            return Interpreted(self.setup, self.listener, interrupts)
+        return InProcess(self.setup, self.listener, interrupts)
 
     def _finish_run(self, run: Run, maker: Maker, recording: can_logs.Recording | None) -> None:
         """Summary, recording, trace and listener get what they are due of a run. Raises RunError
