@@ -283,8 +283,8 @@ def main() -> int:
     except can.CanError as error:
         tell("error", message=f"controller: bus {arguments.bus} is gone: {error}")
         return 2
-    except OSError as error:
-        tell("error", message=f"controller: memory file: {error}")
+    except OSError as error:  # of the memory file, of the timing
+        tell("error", message=f"controller: {error}")
         return 1
     finally:
         bus.shutdown()

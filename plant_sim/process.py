@@ -411,6 +411,9 @@ def main() -> int:
         names = ", ".join(arguments.bus)
         tell("error", message=f"plant: bus {names} is gone: {error}")
         return 2
+    except OSError as error:  # of what it leaves for the parent
+        tell("error", message=f"plant: {error}")
+        return 1
     finally:
         opened.close()
     tell("done")

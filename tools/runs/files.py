@@ -15,7 +15,8 @@ def write_bytes(path: Path, content: bytes) -> None:
     try:
         temporary.write_bytes(content)
         os.replace(temporary, path)
-    except OSError:
+    except OSError as error:
+        error.filename = str(path)  # a write that fails does not name its file
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise

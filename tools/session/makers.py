@@ -21,7 +21,7 @@ from ato_hil.tools.session import in_process, processes
 from ato_hil.tools.session.interrupts import Interrupts
 from ato_hil.tools.session.options import Listener, Setup
 from ato_hil.tools.trace import facts
-from ato_hil.tools.trace.writer import TraceWriter
+from ato_hil.tools.trace.writer import TraceError, TraceWriter
 
 
 class Maker(Protocol):
@@ -86,7 +86,10 @@ class InProcess:
             facts.apply(facts.of(run), self._writer)
 
     def _close_trace(self, writer: TraceWriter) -> None:
-        writer.close()
+        try:
+            writer.close()
+        except TraceError as error:
+            raise processes.RunError(str(error)) from None
         self.us_per_frame = writer.us_per_frame
 
     def _made(self) -> Generator[Run, None, None]:

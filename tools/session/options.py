@@ -18,7 +18,7 @@ from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.registry import load_law
 from ato_hil.plant_sim import failures
 from ato_hil.plant_sim.scenario import Loaded, load, members
-from ato_hil.tools.runs import can_logs, locks, onboard
+from ato_hil.tools.runs import can_logs, limits, locks, onboard
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
 from ato_hil.tools.session import processes
 from ato_hil.tools.session.external_nodes import CONTROLLER, PLANT
@@ -155,13 +155,16 @@ def check(options: Options, held: ExitStack) -> Setup:
     writes.
 
     Raises ScenarioError, LawError, CalibrationError, MemoryFileError, RecordError, FaultError or
-    SessionError for what is not good, LockedError for a file that another session has.
+    SessionError for what is not good, LimitError for what the system does not give, LockedError for
+    a file that another session has.
     """
     for name, value, least in (("runs", options.runs, 1), ("seed", options.seed, 0)):
         if value is not None and (not isinstance(value, int) or value < least):
             raise SessionError(f"{name} is {value!r}, expected a whole number from {least} on")
     if options.mode not in MODES:
         raise SessionError(f"mode is {options.mode!r}, expected one of {', '.join(MODES)}")
+    limits.check_address_space(options.trace)
+    limits.check_descriptors()
     if options.mode != "mil":
         require_compiler()
     loaded = load(options.scenario)

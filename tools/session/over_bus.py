@@ -116,6 +116,7 @@ class OverBus:
                     self.injected = faults.injected(kept)
                 if self._recorder is not None and "traced" in self._recorder.said:
                     self.us_per_frame = self._recorder.said["traced"]["us_per_frame"]
+            self._refuse_incomplete_trace()
 
     def tell(self, run: Run) -> None:
         """What is known of the run to the recorder's trace; the recorder has the frames, and knows
@@ -162,6 +163,14 @@ class OverBus:
             if led is not None and bench.over(event["run"]):
                 return self._run(bench, led, bench.nodes["recorder"].runs[event["run"]])
         return None
+
+    def _refuse_incomplete_trace(self) -> None:
+        """Raises RunError if the recorder could not write all of it."""
+        recorder = self._recorder
+        if recorder is not None and self.setup.options.trace and "traced" not in recorder.said:
+            file = self.setup.options.out / "trace.rrd"
+            told = recorder.said.get("error", {})
+            raise RunError(told.get("message", f"{file}: the trace is incomplete"))
 
     def _say_if_suspended(self, bench: Bench) -> None:
         """In lockstep nothing comes of it."""

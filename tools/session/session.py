@@ -9,14 +9,15 @@ Only HIL can also go by the clock, pace `realtime`: its digest depends on what w
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Generator, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from ato_hil.can_dbc import faults
+from ato_hil.can_dbc.errors import InputError
 from ato_hil.can_dbc.step import INTERPRETED
 from ato_hil.controller.registry import is_file
 from ato_hil.plant_sim.scenario import FOLDER
@@ -115,16 +116,28 @@ class Session:
         """Makes the runs, each when it is asked for; whatever ends the iteration ends the session
         and writes its summary. Raises as `run`."""
         interrupts = Interrupts()
-        with self.held, interrupts, closing(self._runs(interrupts)) as made:
+        with self._one_line(), self.held, interrupts, closing(self._runs(interrupts)) as made:
             for run in made:
                 with interrupts.let_through():
                     yield run
 
     def complete(self) -> None:
         """Makes all runs. Raises as `run`."""
-        with self.held, Interrupts() as interrupts:
+        with self._one_line(), self.held, Interrupts() as interrupts:
             for _run in self._runs(interrupts):
                 pass
+
+    @contextmanager
+    def _one_line(self) -> Iterator[None]:
+        """Raises RunError for what the system refuses: a full disk, no more descriptors."""
+        try:
+            yield
+        except OSError as error:
+            raise RunError(self._text_of(error)) from None
+
+    def _text_of(self, error: OSError) -> str:
+        reason = error.strerror or str(error)
+        return f"{error.filename or self.setup.options.out}: {reason}"
 
     def _runs(self, interrupts: Interrupts) -> Generator[Run, None, None]:
         maker: Maker | None = None
@@ -136,7 +149,10 @@ class Session:
                 for run in made:
                     self._finish_run(run, maker, recording)
                     yield run
-        except RunError as error:
+        except OSError as error:
+            self.summary["ended_early"] = self._text_of(error)
+            raise
+        except (RunError, InputError) as error:
             self.summary["ended_early"] = str(error)
             raise
         except KeyboardInterrupt:
