@@ -251,6 +251,7 @@ def main() -> int:
         )
         node.cycle(controller, 0)  # compiles, or loads what was compiled before
         intact(TRAIN_POSITION, 0)
+        get(0, RUN_CTRL.RunState)  # likewise: while a run is armed there is no time for it
         controller.tx["fresh"].fill(0)
         inbox = inbox_of(controller, receiver(arguments.faults, CONTROLLER, arguments.train))
         bus = open_bus(arguments.bus)

@@ -431,6 +431,7 @@ def warm_up(here: world.World) -> None:
     plant.announce(here.state[0]["node"], plant.IDLE, 0, here.tx[0])
     plant.confirmed(here.state[0]["node"], here.rx[0])
     intact(FORCE_CMD, 0)
+    get(0, ATO_STATUS.Faults)
     here.tx["fresh"][:] = 0
 
 
