@@ -251,6 +251,7 @@ def main() -> int:
         )
         node.cycle(controller, 0)  # compiles, or loads what was compiled before
         intact(TRAIN_POSITION, 0)
+        get(0, RUN_CTRL.RunState)  # likewise: while a run is armed there is no time for it
         controller.tx["fresh"].fill(0)
         inbox = inbox_of(controller, receiver(arguments.faults, CONTROLLER, arguments.train))
         bus = open_bus(arguments.bus)
@@ -283,8 +284,8 @@ def main() -> int:
     except can.CanError as error:
         tell("error", message=f"controller: bus {arguments.bus} is gone: {error}")
         return 2
-    except OSError as error:
-        tell("error", message=f"controller: memory file: {error}")
+    except OSError as error:  # of the memory file, of the timing
+        tell("error", message=f"controller: {error}")
         return 1
     finally:
         bus.shutdown()

@@ -1,15 +1,18 @@
 """The learning memory on disk: a header, the cells, a CRC-32 over all.
 
 Written to a temporary file, fsynced and renamed; the last good generation is kept as
-FILE.previous. A file that does not match the law and the scenario, or does not verify, is refused
-with one line, never half used.
+FILE.previous, a second name of it, or a copy where a file has but one. A file that does not match
+the law and the scenario, or does not verify, is refused with one line, never half used.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import struct
+import tempfile
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +24,8 @@ from ato_hil.controller.registry import law_label
 
 MAGIC = b"ATOLEARN"
 VERSION = 1
+# What os.link raises on a file system without hard links, or with as many as it can have.
+_NO_LINKS = (errno.EPERM, errno.EACCES, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EMLINK)
 # magic, version, iteration, cells, words, bytes a word, law, scenario digest
 _HEADER = struct.Struct("<8sIIIII32s64s")
 
@@ -28,6 +33,10 @@ _HEADER = struct.Struct("<8sIIIII32s64s")
 class MemoryFileError(InputError):
     """The file is no learning memory for this law and scenario; the message names file and
     reason."""
+
+
+class MemoryWriteError(MemoryFileError, OSError):
+    """The file cannot be written; what was there is still whole."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +48,8 @@ class Stored:
 
 
 def save(path: Path, calibration: Calibration, cells: np.ndarray, iteration: int) -> None:
-    """Writes `cells` [cells, words] so that at any moment FILE or FILE.previous is whole."""
+    """Writes `cells` [cells, words] so that at any moment FILE or FILE.previous is whole; a link is
+    written through. Raises MemoryWriteError, and leaves what was there."""
     header = _HEADER.pack(
         MAGIC,
         VERSION,
@@ -51,26 +61,91 @@ def save(path: Path, calibration: Calibration, cells: np.ndarray, iteration: int
         calibration.scenario_digest.encode()[:64],
     )
     body = header + np.ascontiguousarray(cells).tobytes()
+    path = path.resolve()  # a link stays one
     temporary = _unfinished(path)
-    with open(temporary, "wb") as stream:
-        stream.write(body + struct.pack("<I", zlib.crc32(body)))
+    try:
+        _write(temporary, body + struct.pack("<I", zlib.crc32(body)))
+        if path.exists():
+            _keep(path, path.with_name(path.name + ".previous"))
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        reason = error.strerror or str(error)
+        raise MemoryWriteError(f"{path}: cannot be written: {reason}") from None
+    with suppress(OSError):
+        _sync_folder(path.parent)
+
+
+def check_target(path: Path) -> list[str]:
+    """What is weaker where the folder of a memory file lacks something, a line each.
+
+    Raises MemoryFileError if the file cannot be written there.
+    """
+    target = path.resolve()
+    folder = target.parent
+    weaker = []
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        descriptor, name = tempfile.mkstemp(prefix=f"{target.name}.", suffix=".new", dir=folder)
+        os.close(descriptor)
+    except OSError as error:
+        raise MemoryFileError(f"{path}: cannot be written: {error.strerror}") from None
+    trial = Path(name)
+    second = trial.with_suffix(".link")
+    try:
+        os.link(trial, second)
+    except OSError as error:
+        weaker.append(f"no hard links ({error.strerror}), FILE.previous is a copy")
+    try:
+        _sync_folder(folder)
+    except OSError as error:
+        weaker.append(
+            f"folder cannot be synchronised ({error.strerror}), a power cut may undo a run"
+        )
+    for file in (trial, second):
+        file.unlink(missing_ok=True)
+    return [f"{folder}: {text}" for text in weaker]
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Writes a file, and waits until it is on the disk."""
+    with open(path, "wb") as stream:
+        stream.write(content)
         stream.flush()
         os.fsync(stream.fileno())
-    if path.exists():
-        previous = path.with_name(path.name + ".previous")
-        previous.unlink(missing_ok=True)
-        os.link(path, previous)
-    os.replace(temporary, path)
-    directory = os.open(path.parent, os.O_RDONLY)
+
+
+def _keep(path: Path, previous: Path) -> None:
+    """Keeps what a file holds under a second name; both are whole at any moment, or not there."""
+    previous.unlink(missing_ok=True)
     try:
-        os.fsync(directory)
+        os.link(path, previous)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        copy = previous.with_name(previous.name + ".new")
+        try:
+            _write(copy, path.read_bytes())
+            os.replace(copy, previous)
+        finally:
+            copy.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Has the names in a folder written. Raises OSError, also where that does not exist."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
     finally:
-        os.close(directory)
+        os.close(descriptor)
 
 
 def remove_unfinished(path: Path) -> None:
     """Removes what a `save` has left that was killed."""
-    _unfinished(path).unlink(missing_ok=True)
+    target = path.resolve()
+    for file in (target, target.with_name(target.name + ".previous")):
+        _unfinished(file).unlink(missing_ok=True)
 
 
 def _unfinished(path: Path) -> Path:

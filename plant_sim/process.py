@@ -411,6 +411,9 @@ def main() -> int:
         names = ", ".join(arguments.bus)
         tell("error", message=f"plant: bus {names} is gone: {error}")
         return 2
+    except OSError as error:  # of what it leaves for the parent
+        tell("error", message=f"plant: {error}")
+        return 1
     finally:
         opened.close()
     tell("done")
@@ -428,6 +431,7 @@ def warm_up(here: world.World) -> None:
     plant.announce(here.state[0]["node"], plant.IDLE, 0, here.tx[0])
     plant.confirmed(here.state[0]["node"], here.rx[0])
     intact(FORCE_CMD, 0)
+    get(0, ATO_STATUS.Faults)
     here.tx["fresh"][:] = 0
 
 

@@ -1,6 +1,8 @@
 """The learning memory on disk: what is damaged or foreign is refused, what was there is kept."""
 
+import errno
 import os
+import stat
 import struct
 import zlib
 from dataclasses import replace
@@ -228,3 +230,82 @@ def test_the_header_is_little_endian_and_fixed(path):
 def test_the_calibration_alone_decides_what_fits(path, calibration, cells):
     again = replace(calibration, profile=np.ones(3))
     assert (store.load(path, again).cells == cells).all()
+
+
+# Folders that lack something.
+
+
+def broken(code):
+    def fail(*_arguments, **_options):
+        raise OSError(code, os.strerror(code))
+
+    return fail
+
+
+@pytest.mark.parametrize("code", [errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_without_hard_links_the_previous_generation_is_a_copy(
+    path, calibration, cells, code, monkeypatch
+):
+    monkeypatch.setattr(os, "link", broken(code))
+    previous = path.with_name("learned.bin.previous")
+    for iteration in (8, 9):
+        store.save(path, calibration, cells, iteration)
+        assert store.load(path, calibration).iteration == iteration
+        assert store.load(previous, calibration).iteration == iteration - 1
+    (weaker,) = store.check_target(path)
+    assert weaker == (
+        f"{path.parent}: no hard links ({os.strerror(code)}), FILE.previous is a copy"
+    )
+    assert sorted(file.name for file in path.parent.iterdir()) == [path.name, previous.name]
+
+
+@pytest.mark.parametrize("code", [errno.EINVAL, errno.EIO])
+def test_a_folder_that_cannot_be_synchronised_is_said(path, calibration, cells, code, monkeypatch):
+    fsync = os.fsync
+
+    def of_files_alone(file):
+        if stat.S_ISDIR(os.fstat(file).st_mode):
+            broken(code)()
+        fsync(file)
+
+    monkeypatch.setattr(os, "fsync", of_files_alone)
+    store.save(path, calibration, cells, 8)
+    assert store.load(path, calibration).iteration == 8
+    (weaker,) = store.check_target(path)
+    assert weaker.startswith(f"{path.parent}: folder cannot be synchronised")
+    assert sorted(file.name for file in path.parent.iterdir()) == [
+        path.name,
+        f"{path.name}.previous",
+    ]
+
+
+def test_a_link_is_written_through(tmp_path, path, calibration, cells):
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "elsewhere" / "link"
+    link.symlink_to(path)
+    store.save(link, calibration, cells, 8)
+    assert link.is_symlink()
+    assert store.load(link, calibration).iteration == store.load(path, calibration).iteration == 8
+    assert [file.name for file in link.parent.iterdir()] == ["link"]
+
+
+def test_a_write_that_fails_leaves_nothing_behind(path, calibration, cells, monkeypatch):
+    monkeypatch.setattr(os, "replace", broken(errno.ENOSPC))
+    with pytest.raises(store.MemoryFileError, match="cannot be written: No space left on device"):
+        store.save(path, calibration, cells, 8)
+    assert store.load(path, calibration).iteration == 7
+    assert not list(path.parent.glob("*.new"))
+
+
+def test_a_file_that_cannot_be_written_is_named_before(tmp_path):
+    for path, reason in (
+        (tmp_path / "none" / "x", "No such file or directory"),
+        (tmp_path, "Is a directory"),
+        (tmp_path / "file" / "x", "Not a directory"),
+    ):
+        (tmp_path / "file").touch()
+        with pytest.raises(store.MemoryFileError) as refused:
+            store.check_target(path)
+        assert str(refused.value) == f"{path}: cannot be written: {reason}"
+    assert store.check_target(tmp_path / "new") == []
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ato_hil.plant_sim.scenario import Loaded, members
-from ato_hil.tools.runs import onboard
+from ato_hil.tools.runs import limits, onboard
 from ato_hil.tools.session import in_process
 from ato_hil.tools.session.session import prepare
 from ato_hil.tools.trace import facts
@@ -32,6 +32,8 @@ def compare(
     trains = members(loaded)
     for law in laws:  # a wrong one is refused before anything runs
         onboard.controllers_for(trains, law)
+    limits.check_address_space(trace=True)
+    limits.check_descriptors()
     prepare(trace_file.parent)
     writer = TraceWriter(
         trace_file,

@@ -45,13 +45,14 @@ def compare(
     with one_line_for_bad_input():
         from ato_hil.plant_sim.scenario import load
         from ato_hil.tools.campaigns import compare as side_by_side
-        from ato_hil.tools.runs import files
+        from ato_hil.tools.runs import files, locks
 
         loaded = load(scenario)
         names = [law.strip() for law in laws.split(",") if law.strip()]
         say_if_compiling()
         with (
             places.folder(out, f"{loaded.folder_name}-compare", overwrite) as place,
+            locks.folder_held(place.work),
             working("compiling, where it is the first time") as update,
         ):
             rows = side_by_side.compare(
@@ -101,12 +102,16 @@ def sweep(
     error."""
     from ato_hil.plant_sim.scenario import load
     from ato_hil.tools.campaigns import sweep as side_by_side
+    from ato_hil.tools.runs import locks
 
     try:
         with one_line_for_bad_input():
             points = side_by_side.plan(scenario, law, vary, runs, seed)
             loaded = load(scenario)
-            with places.folder(out, f"{loaded.folder_name}-sweep", overwrite) as place:
+            with (
+                places.folder(out, f"{loaded.folder_name}-sweep", overwrite) as place,
+                locks.folder_held(place.work),
+            ):
                 rows = _sweep(points, loaded, place.work)
     except KeyboardInterrupt:
         raise fail("interrupted; nothing was written", EXIT_INTERRUPTED) from None

@@ -64,15 +64,15 @@ def one_line_for_bad_input() -> Iterator[None]:
         raise fail(refusal(error), EXIT_BAD_INPUT) from None
 
 
-@contextmanager
-def sigterm_as_ctrl_c() -> Iterator[None]:
-    """What SIGTERM ends, ends as with Ctrl-C: with what it has."""
+def end_as_with_ctrl_c() -> None:
+    """What SIGTERM ends, or SIGHUP of a terminal that is closed, ends as with Ctrl-C: with what it
+    has. Such a signal comes once: a shell and the system may both send it."""
 
     def interrupt(*_: object) -> None:
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:  # nohup has it ignored
+            signal.signal(number, interrupt)

@@ -34,6 +34,8 @@ def examine() -> list[Finding]:
         _viewer(),
         _pictures(),
         _microcontroller(),
+        _limits(),
+        _locks(),
     ]
 
 
@@ -186,3 +188,44 @@ def _microcontroller() -> Finding:
         text = f"for `--mode pil`: apt-get install {' '.join(missing)}"
         return Finding("microcontroller", "absent", text)
     return Finding("microcontroller", "works", "emulator and compiler for `--mode pil`")
+
+
+def _limits() -> Finding:
+    """Limits of the shell or the system that a session meets."""
+    import resource
+
+    from ato_hil.tools.runs import limits
+
+    what = "limits"
+    try:
+        limits.check_address_space(trace=False)
+        limits.check_descriptors()
+    except limits.LimitError as error:
+        return Finding(what, "broken", str(error))
+    texts = []
+    try:
+        limits.check_address_space(trace=True)
+    except limits.LimitError as error:
+        texts.append(str(error))
+    size = limits.limit(resource.RLIMIT_FSIZE)
+    if size != float("inf"):
+        texts.append(f"files end at {size / 1e6:g} MB (ulimit -f), traces and recordings as well")
+    return Finding(what, "works", "; ".join(texts) or "address space, files, descriptors suffice")
+
+
+def _locks() -> Finding:
+    """Whether a second session is kept from the files of the first, in this folder."""
+    import fcntl
+
+    what = "locks"
+    descriptor = os.open(".", os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        pass  # a session has this folder
+    except OSError as error:
+        text = f"the file system of this folder has none ({error.strerror}): start one session here"
+        return Finding(what, "absent", f"{text} at a time")
+    finally:
+        os.close(descriptor)
+    return Finding(what, "works", "one session at a time has a folder, a memory file, a bus")

@@ -14,7 +14,6 @@ from ato_hil.tools.cli.console import (
     fail,
     one_line_for_bad_input,
     say,
-    sigterm_as_ctrl_c,
 )
 from ato_hil.tools.cli.options import Picture, ScenarioName
 from ato_hil.tools.cli.output import console
@@ -96,7 +95,7 @@ def view(
     from ato_hil.tools.trace import live_viewer
     from ato_hil.tools.trace import viewer as finished
 
-    with one_line_for_bad_input(), sigterm_as_ctrl_c():
+    with one_line_for_bad_input():
         recorded = finished.load(folders)
         with finished.prepared(recorded, law_compare) as trace:
             if screenshot is not None:

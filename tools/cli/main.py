@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import resource
 import sys
 from collections.abc import Callable
 from typing import Annotated
@@ -10,8 +11,10 @@ from typing import Annotated
 import typer
 
 from ato_hil.tools.cli import buses, clean, compare, export, look, prove, run
+from ato_hil.tools.cli.console import EXIT_ENDED_EARLY, end_as_with_ctrl_c, fail
 from ato_hil.tools.cli.options import Viewer
 from ato_hil.tools.cli.output import ignore_other_tools, streams
+from ato_hil.tools.runs.limits import limit
 
 app = typer.Typer(
     name="ato-hil",
@@ -82,8 +85,18 @@ def main() -> None:
         if word == "--view" and sys.argv[at + 1 : at + 2] not in (["web"], ["native"]):
             sys.argv[at] = f"--view={Viewer.native.value}"
     ignore_other_tools()
+    end_as_with_ctrl_c()
     with streams():
-        app()
+        try:
+            app()
+        except (OSError, MemoryError, ImportError) as error:  # what the system refuses
+            if isinstance(error, ImportError) and limit(resource.RLIMIT_AS) == float("inf"):
+                raise
+            file = getattr(error, "filename", None)
+            where = f"{file}: " if file else ""
+            reason = getattr(error, "strerror", None) or str(error) or "there is no more memory"
+            fail(f"{where}{reason}", EXIT_ENDED_EARLY)
+            sys.exit(EXIT_ENDED_EARLY)
 
 
 if __name__ == "__main__":

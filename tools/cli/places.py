@@ -10,11 +10,12 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from ato_hil.can_dbc.errors import InputError
+from ato_hil.tools.runs import locks
 
 RUNS = Path("runs")
 RESULTS = (
@@ -44,26 +45,28 @@ def folder(out: Path | None, name: str, overwrite: bool) -> Iterator[Place]:
     finished, and with an error or Ctrl-C if they are not.
 
     Raises PlaceError if `out` has results and they are not to be overwritten, or there can be no
-    folder.
+    folder, LockedError if another session is about to overwrite them. What is made in `work` is
+    for its maker to lock.
     """
-    try:
-        place = _new(name) if out is None else _given(out, overwrite)
-    except OSError as error:
-        text = f"{out or RUNS}: cannot write there: {error.strerror}"
-        raise PlaceError(text) from None
-    try:
-        yield place
-    except BaseException:  # where nothing was written, nothing stays
-        with suppress(OSError):
-            if place.made:
-                place.work.rmdir()
-                RUNS.rmdir()
-        raise
-    if place.work != place.final:
-        for pattern in (*RESULTS, *DRAWN):
-            for old in place.final.glob(pattern):
-                old.unlink()
-        _move(place.work, place.final)
+    with ExitStack() as held:
+        try:
+            place = _new(name) if out is None else _given(out, overwrite, held)
+        except OSError as error:
+            text = f"{out or RUNS}: cannot write there: {error.strerror}"
+            raise PlaceError(text) from None
+        try:
+            yield place
+        except BaseException:  # where nothing was written, nothing stays
+            with suppress(OSError):
+                if place.made:
+                    place.work.rmdir()
+                    RUNS.rmdir()
+            raise
+        if place.work != place.final:
+            for pattern in (*RESULTS, *DRAWN):
+                for old in place.final.glob(pattern):
+                    old.unlink()
+            _move(place.work, place.final)
 
 
 @contextmanager
@@ -75,9 +78,10 @@ def recording(path: Path | None, overwrite: bool) -> Iterator[Path | None]:
     if not overwrite:
         raise PlaceError(f"{path}: there is a recording; expected another name, or --overwrite")
     work = path.parent / f"{UNFINISHED}-{path.stem}"
-    _empty(work)
-    yield work / path.name
-    _move(work, path.parent)
+    with locks.file_held(path):
+        _empty(work)
+        yield work / path.name
+        _move(work, path.parent)
 
 
 def _new(name: str) -> Place:
@@ -94,13 +98,14 @@ def _new(name: str) -> Place:
         return Place(path, path, True)
 
 
-def _given(out: Path, overwrite: bool) -> Place:
+def _given(out: Path, overwrite: bool, held: ExitStack) -> Place:
     if not any((out / name).exists() for name in RESULTS):
         made = not out.exists()
         out.mkdir(parents=True, exist_ok=True)
         return Place(out, out, made)
     if not overwrite:
         raise PlaceError(f"{out}: there are results; expected another folder, or --overwrite")
+    held.enter_context(locks.folder_held(out))
     _empty(out / UNFINISHED)
     return Place(out / UNFINISHED, out, True)
 

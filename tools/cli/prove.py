@@ -17,7 +17,6 @@ from ato_hil.tools.cli.console import (
     fail,
     one_line_for_bad_input,
     say,
-    sigterm_as_ctrl_c,
     working,
 )
 from ato_hil.tools.cli.options import Mode, Overwrite
@@ -145,6 +144,7 @@ def threats(
     came of it."""
     from ato_hil.tools.campaigns import threats as campaign
     from ato_hil.tools.campaigns import undetected
+    from ato_hil.tools.runs import locks
     from ato_hil.tools.session.processes import RunError
 
     if mode not in (Mode.sil, Mode.hil):
@@ -156,8 +156,8 @@ def threats(
     try:
         with (
             one_line_for_bad_input(),
-            sigterm_as_ctrl_c(),
             places.folder(out, "threats", overwrite) as place,
+            locks.folder_held(place.work),
             working("compiling ...") as update,
         ):
             rates = undetected.measure(RESIDUAL_FRAMES, seed)
@@ -233,7 +233,6 @@ def noise(
     try:
         with (
             one_line_for_bad_input(),
-            sigterm_as_ctrl_c(),
             working("compiling ...") as update,
         ):
             found = flood.beside(scenario, law, frames, seed, bus, update)
@@ -277,14 +276,14 @@ def endurance(
 ) -> None:
     """Kill and stop nodes of sessions at random moments: each has to end named and clean."""
     from ato_hil.tools.campaigns import endurance as trials
-    from ato_hil.tools.runs import files
+    from ato_hil.tools.runs import files, locks
 
     say(f"{times} sessions, some seconds each", "dim")
     done: list[Outcome] = []
     with (
         one_line_for_bad_input(),
-        sigterm_as_ctrl_c(),
         places.folder(out, "endurance", overwrite) as place,
+        locks.folder_held(place.work),
     ):
         with working("") as update, suppress(KeyboardInterrupt):  # what was done counts
             for outcome in trials.campaign(trials.plan(times, seed), place.work):

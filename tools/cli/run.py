@@ -22,7 +22,6 @@ from ato_hil.tools.cli.console import (
     one_line_for_bad_input,
     say,
     say_if_compiling,
-    sigterm_as_ctrl_c,
 )
 from ato_hil.tools.cli.expect import Expectation, check_keys, parse, unmet
 from ato_hil.tools.cli.options import (
@@ -229,7 +228,7 @@ def run(
     ] = None,
 ) -> None:
     """Run a scenario: the train follows its profile, run by run."""
-    with one_line_for_bad_input(), sigterm_as_ctrl_c(), ExitStack() as stack:
+    with one_line_for_bad_input(), ExitStack() as stack:
         from ato_hil.tools.session.session import Options
 
         expected = [parse(text) for text in expect or ()]

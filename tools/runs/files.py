@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,14 @@ from typing import Any
 def write_bytes(path: Path, content: bytes) -> None:
     """Writes a file. Raises OSError, and leaves what was there."""
     temporary = path.with_name(f"{path.name}.new")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    except OSError as error:
+        error.filename = str(path)  # a write that fails does not name its file
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
 
 
 def write_text(path: Path, text: str) -> None:

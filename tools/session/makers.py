@@ -18,9 +18,10 @@ from ato_hil.controller.node import Controller
 from ato_hil.tools.runs.can_logs import Recording
 from ato_hil.tools.runs.result import Run
 from ato_hil.tools.session import boards, in_process, pil, processes
+from ato_hil.tools.session.interrupts import Interrupts
 from ato_hil.tools.session.options import Listener, Setup
 from ato_hil.tools.trace import facts
-from ato_hil.tools.trace.writer import TraceWriter
+from ato_hil.tools.trace.writer import TraceError, TraceWriter
 
 
 class Maker(Protocol):
@@ -51,8 +52,8 @@ class InProcess:
     injected: list[faults.Event] | None = None
     timing: dict[str, Any] | None = None
 
-    def __init__(self, setup: Setup, listener: Listener) -> None:
-        self.setup, self.listener = setup, listener
+    def __init__(self, setup: Setup, listener: Listener, interrupts: Interrupts) -> None:
+        self.setup, self.listener, self.interrupts = setup, listener, interrupts
         self.about: dict[str, Any] = {}
         self.us_per_frame: float | None = None
         self._writer: TraceWriter | None = None
@@ -69,7 +70,13 @@ class InProcess:
                 )
                 stack.callback(self._close_trace, writer)
                 setup.look_on(self.listener, writer.end_live)
-            yield from stack.enter_context(closing(self._made()))
+            made = stack.enter_context(closing(self._made()))
+            while (run := self._next(made)) is not None:
+                yield run
+
+    def _next(self, made: Generator[Run, None, None]) -> Run | None:
+        with self.interrupts.let_through():
+            return next(made, None)
 
     def tell(self, run: Run) -> None:
         """Frames and facts to the writer."""
@@ -79,7 +86,10 @@ class InProcess:
             facts.apply(facts.of(run), self._writer)
 
     def _close_trace(self, writer: TraceWriter) -> None:
-        writer.close()
+        try:
+            writer.close()
+        except TraceError as error:
+            raise processes.RunError(str(error)) from None
         self.us_per_frame = writer.us_per_frame
 
     def _made(self) -> Generator[Run, None, None]:
@@ -119,12 +129,15 @@ class Interpreted(InProcess):
     """The same of a child that interprets: what is chosen when the steps are imported cannot be
     chosen again."""
 
+    def _next(self, made: Generator[Run, None, None]) -> Run | None:
+        return next(made, None)  # the wait for the child lets them through
+
     def _made(self) -> Generator[Run, None, None]:
         setup, options = self.setup, self.setup.options
         with (
             tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch,
             ExitStack() as afterwards,
-            processes.Bench(options.out, []) as bench,
+            processes.Bench(options.out, [], interrupts=self.interrupts) as bench,
         ):
             arguments = ["--scenario", setup.loaded.source, "--law", setup.law, "--out", scratch]
             arguments += ["--first-run", str(setup.runs[0]), "--last-run", str(setup.runs[-1])]

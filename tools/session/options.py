@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,12 +13,12 @@ import numpy as np
 from ato_hil.can_dbc import faults
 from ato_hil.can_dbc.errors import InputError
 from ato_hil.can_dbc.step import require_compiler
-from ato_hil.controller import library, node
+from ato_hil.controller import library, node, store
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.registry import load_law
 from ato_hil.plant_sim import failures
 from ato_hil.plant_sim.scenario import Loaded, load, members
-from ato_hil.tools.runs import can_logs, onboard
+from ato_hil.tools.runs import can_logs, limits, locks, onboard
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
 from ato_hil.tools.session import boards, processes
 from ato_hil.tools.session.external_nodes import CONTROLLER, PLANT
@@ -101,6 +102,7 @@ class Setup:
     calibrations: list[Calibration]  # of each controller; none of an external one
     runs: range
     faults: Faults | None  # to inject
+    notes: tuple[str, ...]  # what is weaker here than usual
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -149,14 +151,21 @@ class Setup:
             listener.note(viewer.start())
 
 
-def check(options: Options) -> Setup:
-    """Raises ScenarioError, LawError, CalibrationError, MemoryFileError, RecordError, FaultError or
-    SessionError for what is not good."""
+def check(options: Options, held: ExitStack) -> Setup:
+    """What was asked for, if it is good; `held` gets the locks of the files that the session
+    writes.
+
+    Raises ScenarioError, LawError, CalibrationError, MemoryFileError, RecordError, FaultError or
+    SessionError for what is not good, LimitError for what the system does not give, LockedError for
+    a file that another session has.
+    """
     for name, value, least in (("runs", options.runs, 1), ("seed", options.seed, 0)):
         if value is not None and (not isinstance(value, int) or value < least):
             raise SessionError(f"{name} is {value!r}, expected a whole number from {least} on")
     if options.mode not in MODES:
         raise SessionError(f"mode is {options.mode!r}, expected one of {', '.join(MODES)}")
+    limits.check_address_space(options.trace)
+    limits.check_descriptors()
     if options.mode != "mil":
         require_compiler()
     loaded = load(options.scenario)
@@ -165,15 +174,20 @@ def check(options: Options) -> Setup:
         _refuse_what_is_for_one_train(options)
     if options.pace == REALTIME:
         _refuse_without_clock(options)
+    weaker: list[str] = []
+    if options.memory is not None:
+        weaker = store.check_target(options.memory)
+        held.enter_context(locks.file_held(options.memory))  # before it is read
     law, calibrations, runs = _controllers(options, trains)
     if runs[-1] > RUNS_MAX:
         raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
     if options.record is not None:
         can_logs.check_target(options.record)
+        held.enter_context(locks.file_held(options.record))
     asked = None
     if options.faults is not None:
         asked = _faults(options, options.faults, loaded)
-    return Setup(options, loaded, trains, law, calibrations, runs, asked)
+    return Setup(options, loaded, trains, law, calibrations, runs, asked, tuple(weaker))
 
 
 def _refuse_what_is_for_one_train(options: Options) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Generator
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from ato_hil.can_dbc import faults
 from ato_hil.can_dbc.bus import choose_bus, open_bus, recv_frames
 from ato_hil.controller import store
 from ato_hil.controller.interface import fault_names
+from ato_hil.tools.runs import locks
 from ato_hil.tools.runs.can_logs import Recording
 from ato_hil.tools.runs.result import Run
 from ato_hil.tools.session import processes, realtime
@@ -25,6 +26,7 @@ from ato_hil.tools.session.external_nodes import (
     PLANT,
     measured_truth,
 )
+from ato_hil.tools.session.interrupts import Interrupts
 from ato_hil.tools.session.options import REALTIME, Listener, SessionError, Setup
 from ato_hil.tools.session.processes import Bench, RunError
 from ato_hil.tools.session.recorder import frames_folder, save_settings
@@ -36,15 +38,19 @@ BUSY_S = 0.3  # how long to listen for other traffic, on all buses together
 class OverBus:
     """The runs of one session."""
 
-    def __init__(self, setup: Setup, listener: Listener) -> None:
-        """Raises BusError or SessionError if there is no such bus, or it cannot be used."""
-        self.setup, self.listener = setup, listener
+    def __init__(
+        self, setup: Setup, listener: Listener, held: ExitStack, interrupts: Interrupts
+    ) -> None:
+        """Raises BusError, LockedError or SessionError if there is no such bus, or it cannot be
+        used; `held` gets the locks of the buses."""
+        self.setup, self.listener, self.interrupts = setup, listener, interrupts
         self.recording: Recording | None = None
         self.us_per_frame: float | None = None  # that the trace has taken
         self.injected: list[faults.Event] | None = None  # faults, once all is over
         self._recorder: processes.Node | None = None
         self._kept = Path()  # files on their way
         self._account: realtime.Account | None = None
+        self._asleep_s = 0.0  # that this process is known to have been suspended
         options = setup.options
         choice = choose_bus(options.bus)
         if choice.interface == "virtual":
@@ -55,6 +61,8 @@ class OverBus:
         self._buses = buses = line_buses(choice.name, len(setup.members))
         through = f" to {buses[-1]}" if len(buses) > 1 else ""
         listener.note(f"bus {buses[0]}{through}: {choice.reason}")
+        ours = {PLANT, CONTROLLER} - set(options.external)
+        held.enter_context(locks.buses_held(buses, sorted(ours)))
         if PLANT not in options.external:  # which may well be there, and announce itself
             for bus in buses:
                 refuse_busy_bus(bus, BUSY_S / len(buses))
@@ -93,10 +101,12 @@ class OverBus:
                 signals=setup.faults.processes if setup.faults is not None else [],
                 real_time=real_time,
                 linger=options.viewer is not None,
+                interrupts=self.interrupts,
             )
             try:
                 with closing(events):
                     for speaker, event, bench in events:
+                        self._say_if_suspended(bench)
                         run = self._on_event(bench, speaker.name, event)
                         if run is not None:
                             yield run
@@ -106,6 +116,7 @@ class OverBus:
                     self.injected = faults.injected(kept)
                 if self._recorder is not None and "traced" in self._recorder.said:
                     self.us_per_frame = self._recorder.said["traced"]["us_per_frame"]
+            self._refuse_incomplete_trace()
 
     def tell(self, run: Run) -> None:
         """What is known of the run to the recorder's trace; the recorder has the frames, and knows
@@ -152,6 +163,22 @@ class OverBus:
             if led is not None and bench.over(event["run"]):
                 return self._run(bench, led, bench.nodes["recorder"].runs[event["run"]])
         return None
+
+    def _refuse_incomplete_trace(self) -> None:
+        """Raises RunError if the recorder could not write all of it."""
+        recorder = self._recorder
+        if recorder is not None and self.setup.options.trace and "traced" not in recorder.said:
+            file = self.setup.options.out / "trace.rrd"
+            told = recorder.said.get("error", {})
+            raise RunError(told.get("message", f"{file}: the trace is incomplete"))
+
+    def _say_if_suspended(self, bench: Bench) -> None:
+        """In lockstep nothing comes of it."""
+        slept_s, self._asleep_s = bench.asleep_s - self._asleep_s, bench.asleep_s
+        if slept_s and self._account is not None:
+            self.listener.note(
+                f"this process was suspended for {slept_s:.0f} s; the run went on by the clock"
+            )
 
     def _run(self, bench: Bench, led: dict[str, Any], heard: dict[str, Any]) -> Run:
         """A run that the node that leads the runs, and the recorder, have both finished."""

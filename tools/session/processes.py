@@ -30,6 +30,7 @@ from ato_hil.controller import calibration as calibrations
 from ato_hil.controller import store
 from ato_hil.controller.calibration import Calibration
 from ato_hil.tools.session.external_nodes import CONTROLLER, PATIENCE_S, PLANT
+from ato_hil.tools.session.interrupts import Interrupts
 
 READY_TIMEOUT_S = 300.0  # the first start compiles
 # The plant's own limit while the observer judges a foreign controller, and names what is wrong.
@@ -39,6 +40,8 @@ STOPPED_S = 2.0  # a process may be stopped for as long
 SILENCE_S = 10.0  # longest without a word of the plant
 ACCOUNT_TIMEOUT_S = 60.0  # from the end of the last run to every node's account of it
 TRACE_TIMEOUT_S = 30.0  # for the recorder to complete the trace
+LAST_ACCOUNT_S = 2.0  # after Ctrl-C, for all nodes to tell of a run that one has told the end of
+ASLEEP_S = 1.0  # a wait that took so much longer than asked for: this process was suspended
 
 
 class RunError(Exception):
@@ -55,7 +58,7 @@ class Node:
     said: dict[str, dict[str, Any]] = field(default_factory=dict)  # last event of each kind
     # Its account of each run that has ended: a node may be a run or more behind another.
     runs: dict[int, dict[str, Any]] = field(default_factory=dict)
-    heard_s: float = field(default_factory=time.monotonic)  # when it last said something
+    heard_s: float = 0.0  # when it last said something, by the clock of its bench
     stopped_s: float | None = None  # since when it is known to be stopped
 
     def command(self, **fields: Any) -> None:
@@ -79,15 +82,30 @@ class RealTime:
 
 class Bench:
     """The nodes of one run. Use as a context manager: leaving it ends every node, but for a
-    recorder that goes on serving viewers (`linger`) until `release`."""
+    recorder that goes on serving viewers (`linger`) until `release`.
 
-    def __init__(self, out: Path, buses: list[str], linger: bool = False) -> None:
+    Its clock stands still while this process does: after Ctrl-Z no node is late for that.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        buses: list[str],
+        linger: bool = False,
+        interrupts: Interrupts | None = None,
+    ) -> None:
         self.out = out
         self.buses = buses
         self.linger = linger
         self.nodes: dict[str, Node] = {}
+        self.leader: Node | None = None  # that leads the runs
         self.accountants: list[Node] = []  # besides the leader: each tells of a run when it is over
-        self.events: queue.Queue[tuple[Node, dict[str, Any]]] = queue.Queue()
+        # None wakes the wait; a signal may put it there at any time, which Queue does not allow.
+        self.events: queue.SimpleQueue[tuple[Node, dict[str, Any]] | None] = queue.SimpleQueue()
+        self.asleep_s = 0.0  # that this process was suspended
+        self._interrupts = interrupts or Interrupts()
+        self._interrupts.wake = lambda: self.events.put(None)
+        self._give_up_s = float("inf")  # when to end without the accounts that are missing
 
     def __enter__(self) -> Bench:
         return self
@@ -96,6 +114,10 @@ class Bench:
         self.end()
         for bus in self.buses if kind is not None else ():
             clear_bus(bus)
+
+    def now_s(self) -> float:
+        """Monotonic time, without that in which this process was suspended."""
+        return time.monotonic() - self.asleep_s
 
     def over(self, run: int | None) -> bool:
         """Whether every accountant has told of a run."""
@@ -118,7 +140,7 @@ class Bench:
                 env={**os.environ, **(environment or {})},
                 start_new_session=True,  # Ctrl-C comes to this process alone
             )
-        node = Node(name, process, log)
+        node = Node(name, process, log, heard_s=self.now_s())
         self.nodes[name] = node
         assert process.stdout is not None
         threading.Thread(target=self._listen, args=(node, process.stdout), daemon=True).start()
@@ -132,16 +154,24 @@ class Bench:
 
     def next_event(self, timeout_s: float) -> tuple[Node, dict[str, Any]] | None:
         """The next event of any node, None after `timeout_s`. Raises RunError for an error or a
-        node that died."""
+        node that died, KeyboardInterrupt after Ctrl-C."""
         self._refuse_stopped()
+        self._heed_interrupt()
+        asked_s = time.monotonic()
         try:
-            node, event = self.events.get(timeout=timeout_s)
+            got = self.events.get(timeout=timeout_s)
         except queue.Empty:
+            got = None
+        over_s = time.monotonic() - asked_s - timeout_s
+        if over_s > ASLEEP_S:
+            self.asleep_s += over_s
+        if got is None:
             return None
+        node, event = got
         node.said[event["event"]] = event
         if event["event"] == "run":
             node.runs[event["run"]] = event
-        node.heard_s = time.monotonic()
+        node.heard_s = self.now_s()
         if event["event"] == "error":
             raise RunError(event["message"])
         if event["event"] == "closed":
@@ -152,9 +182,20 @@ class Bench:
                 )
         return node, event
 
+    def _heed_interrupt(self) -> None:
+        """Raises KeyboardInterrupt after Ctrl-C, when all nodes have told of the last run."""
+        if not self._interrupts.came:
+            return
+        self._give_up_s = min(self._give_up_s, self.now_s() + LAST_ACCOUNT_S)
+        tellers = self.accountants if self.leader is None else [self.leader, *self.accountants]
+        told = {run for node in tellers for run in node.runs}
+        whole = all(run in node.runs for node in tellers for run in told)
+        if (whole and self.events.empty()) or self.now_s() > self._give_up_s:
+            raise KeyboardInterrupt
+
     def _refuse_stopped(self) -> None:
         """Raises RunError for a process that a signal has stopped, and not for a moment."""
-        now_s = time.monotonic()
+        now_s = self.now_s()
         for node in self.nodes.values():
             if not _is_stopped(node):
                 node.stopped_s = None
@@ -165,10 +206,10 @@ class Bench:
 
     def wait_ready(self) -> None:
         """Until every node has said that it is ready."""
-        deadline = time.monotonic() + READY_TIMEOUT_S
+        deadline = self.now_s() + READY_TIMEOUT_S
         while any("ready" not in node.said for node in self.nodes.values()):
             self.next_event(0.5)
-            if time.monotonic() > deadline:
+            if self.now_s() > deadline:
                 late = [node.name for node in self.nodes.values() if "ready" not in node.said]
                 raise RunError(f"{', '.join(late)} not ready within {READY_TIMEOUT_S:g} s")
 
@@ -200,9 +241,12 @@ class Bench:
         """Until the recorder has said that its trace is complete, or has ended."""
         while not {"traced", "closed"} & recorder.said.keys():
             try:
-                node, event = self.events.get(timeout=max(deadline - time.monotonic(), 0.0))
+                got = self.events.get(timeout=max(deadline - time.monotonic(), 0.0))
             except queue.Empty:
                 return
+            if got is None:
+                continue
+            node, event = got
             node.said[event["event"]] = event
 
     def release(self) -> None:
@@ -277,6 +321,7 @@ def run(
     others: Mapping[str, list[str]] | None = None,
     real_time: RealTime | None = None,
     linger: bool = False,
+    interrupts: Interrupts | None = None,
 ) -> Generator[tuple[Node, dict[str, Any], Bench], None, None]:
     """Events of the nodes, `ready` of each first, until all runs are done and recorded; see the
     `tell` calls of the processes.
@@ -285,9 +330,11 @@ def run(
     one of the `external` nodes; `cars` are those that the plant takes a force for, each by itself;
     `firmware` is a library for the controllers; `faults` is the folder of can_dbc/faults.py's
     receiver, `signals` go to the processes when it is time; `others` are further nodes by name,
-    modules with their arguments; `linger` as in Bench. In lockstep, or in `real_time`.
+    modules with their arguments; `linger` and `interrupts` as in Bench. In lockstep, or in
+    `real_time`.
 
-    Raises RunError with one line if a node dies, falls silent or reports an error.
+    Raises RunError with one line if a node dies, falls silent or reports an error,
+    KeyboardInterrupt after Ctrl-C, when no run is in hand.
     """
     on_buses = [word for bus in buses for word in ("--bus", bus)]
     injected = [] if faults is None else ["--faults", str(faults)]
@@ -295,7 +342,7 @@ def run(
     with (
         ExitStack() as afterwards,
         tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch,
-        Bench(out, buses, linger) as bench,
+        Bench(out, buses, linger, interrupts) as bench,
     ):
         if memory_file is not None:
             afterwards.callback(store.remove_unfinished, memory_file)
@@ -343,8 +390,9 @@ def run(
         bench.wait_ready()
         for node in bench.nodes.values():
             yield node, node.said["ready"], bench
+        bench.leader = leader
         leader.command(command="start")
-        leader.heard_s = time.monotonic()  # it was ready long before the others, if they compiled
+        leader.heard_s = bench.now_s()  # it was ready long before the others, if they compiled
         deadline = None
         waiting = list(signals)
         while "done" not in leader.said or not bench.over(last_run(leader)):
@@ -352,12 +400,12 @@ def run(
             if got is not None:
                 waiting = _strike(bench, waiting, got[1], faults)
                 yield (*got, bench)
-            elif not external and time.monotonic() - leader.heard_s > SILENCE_S:
+            elif not external and bench.now_s() - leader.heard_s > SILENCE_S:
                 raise RunError(f"the {leader.name} process hangs: no word for {SILENCE_S:g} s")
             if "done" in leader.said:
-                leader.heard_s = time.monotonic()  # it has no more to say
-                deadline = deadline or time.monotonic() + ACCOUNT_TIMEOUT_S
-                if time.monotonic() > deadline:  # it may have lost just the frame that says so
+                leader.heard_s = bench.now_s()  # it has no more to say
+                deadline = deadline or bench.now_s() + ACCOUNT_TIMEOUT_S
+                if bench.now_s() > deadline:  # it may have lost just the frame that says so
                     run = last_run(leader)
                     late = [node.name for node in bench.accountants if run not in node.runs]
                     raise RunError(f"the {', '.join(late)} has not seen the end of run {run}")

@@ -383,6 +383,7 @@ def main() -> int:
         tell("error", message=f"recorder: {error}")
         return 1
     e2e.check(0, -1, RUN_CTRL.data_id)  # compiles, or loads what was compiled before
+    get(0, RUN_CTRL.Pace)
     gc.freeze()  # the garbage collector need not look at all of Rerun again and again
     tell("ready")
     status = 0

@@ -10,21 +10,23 @@ Only HIL can also go by the clock, pace `realtime`: its digest depends on what w
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Generator, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from ato_hil.can_dbc import faults
+from ato_hil.can_dbc.errors import InputError
 from ato_hil.can_dbc.step import INTERPRETED
 from ato_hil.controller.registry import is_file
 from ato_hil.plant_sim.scenario import FOLDER
-from ato_hil.tools.runs import can_logs, environment
+from ato_hil.tools.runs import can_logs, environment, locks
 from ato_hil.tools.runs.files import write_json, write_text
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
 from ato_hil.tools.runs.result import Run
+from ato_hil.tools.session.interrupts import Interrupts
 from ato_hil.tools.session.makers import InProcess, Interpreted, Maker, OnTarget
 from ato_hil.tools.session.options import (
     LOCKSTEP,
@@ -60,30 +62,34 @@ def run(options: Options, listener: Listener) -> dict[str, Any]:
     """Runs the session; returns and writes the summary.
 
     Raises ScenarioError, LawError, CalibrationError, BusError, MemoryFileError, RecordError,
-    FaultError, SessionError for bad input, RunError if a run ends early (the summary then holds the
-    runs that were completed and the reason), KeyboardInterrupt likewise.
+    FaultError, SessionError for bad input, LockedError for what another session has, RunError if a
+    run ends early (the summary then holds the runs that were completed and the reason),
+    KeyboardInterrupt likewise.
     """
     session = begin(options, listener)
-    with closing(session.runs()) as runs:
-        for _run in runs:
-            pass
+    session.complete()
     return session.summary
 
 
 def begin(options: Options, listener: Listener) -> Session:
     """A session whose input is good, with its folder. Raises as `run`, for bad input."""
-    setup = check(options)
-    prepare(options.out)
-    listener.begin(setup.loaded, setup.law, setup.runs)
-    return Session(setup, listener)
+    with ExitStack() as held:
+        setup = check(options, held)
+        held.enter_context(locks.folder_held(options.out))
+        prepare(options.out)
+        listener.begin(setup.loaded, setup.law, setup.runs)
+        for text in setup.notes:
+            listener.note(text)
+        return Session(setup, listener, held.pop_all())
 
 
 class Session:
-    """A session under way; `summary` is what summary.json holds."""
+    """A session under way; `summary` is what summary.json holds, `held` what no other session may
+    have until the runs are made, or it is closed."""
 
-    def __init__(self, setup: Setup, listener: Listener) -> None:
+    def __init__(self, setup: Setup, listener: Listener, held: ExitStack) -> None:
         options, loaded = setup.options, setup.loaded
-        self.setup, self.listener = setup, listener
+        self.setup, self.listener, self.held = setup, listener, held
         self._injected: list[faults.Event] = []
         self.summary: dict[str, Any] = {
             "schema": SCHEMA,
@@ -110,16 +116,44 @@ class Session:
     def runs(self) -> Generator[Run, None, None]:
         """Makes the runs, each when it is asked for; whatever ends the iteration ends the session
         and writes its summary. Raises as `run`."""
+        interrupts = Interrupts()
+        with self._one_line(), self.held, interrupts, closing(self._runs(interrupts)) as made:
+            for run in made:
+                with interrupts.let_through():
+                    yield run
+
+    def complete(self) -> None:
+        """Makes all runs. Raises as `run`."""
+        with self._one_line(), self.held, Interrupts() as interrupts:
+            for _run in self._runs(interrupts):
+                pass
+
+    @contextmanager
+    def _one_line(self) -> Iterator[None]:
+        """Raises RunError for what the system refuses: a full disk, no more descriptors."""
+        try:
+            yield
+        except OSError as error:
+            raise RunError(self._text_of(error)) from None
+
+    def _text_of(self, error: OSError) -> str:
+        reason = error.strerror or str(error)
+        return f"{error.filename or self.setup.options.out}: {reason}"
+
+    def _runs(self, interrupts: Interrupts) -> Generator[Run, None, None]:
         maker: Maker | None = None
         try:
             with ExitStack() as stack:
-                maker = self._maker()  # before the recording: there may be no such bus
+                maker = self._maker(interrupts)  # before the recording: there may be no such bus
                 recording = stack.enter_context(self._recording())
                 made = stack.enter_context(closing(maker.runs(recording)))
                 for run in made:
                     self._finish_run(run, maker, recording)
                     yield run
-        except RunError as error:
+        except OSError as error:
+            self.summary["ended_early"] = self._text_of(error)
+            raise
+        except (RunError, InputError) as error:
             self.summary["ended_early"] = str(error)
             raise
         except KeyboardInterrupt:
@@ -130,16 +164,17 @@ class Session:
                 self.summary["ended_early"] = "the rest was not asked for"
             raise
         finally:
-            self._conclude(maker)
+            if maker is not None:  # else there was nothing to begin with
+                self._conclude(maker)
 
-    def _maker(self) -> Maker:
+    def _maker(self, interrupts: Interrupts) -> Maker:
         if self.setup.options.mode == "hil":
-            return OverBus(self.setup, self.listener)
+            return OverBus(self.setup, self.listener, self.held, interrupts)
         if self.setup.options.mode == "mil" and not INTERPRETED:
-            return Interpreted(self.setup, self.listener)
+            return Interpreted(self.setup, self.listener, interrupts)
         if self.setup.options.mode == "pil":
-            return OnTarget(self.setup, self.listener)
-        return InProcess(self.setup, self.listener)
+            return OnTarget(self.setup, self.listener, interrupts)
+        return InProcess(self.setup, self.listener, interrupts)
 
     def _finish_run(self, run: Run, maker: Maker, recording: can_logs.Recording | None) -> None:
         """Summary, recording, trace and listener get what they are due of a run. Raises RunError
@@ -160,21 +195,20 @@ class Session:
         self.summary["runs"].append(row)
         self.listener.row(row)
 
-    def _conclude(self, maker: Maker | None) -> None:
+    def _conclude(self, maker: Maker) -> None:
         """Write the summary."""
         out = self.setup.options.out
-        if maker is not None:
-            self.summary |= maker.about
-            if maker.injected is not None:
-                self._injected = maker.injected
-                self._save_injected()
-            if maker.timing is not None:
-                self.summary["timing"] = maker.timing
-            if maker.us_per_frame is not None:
-                self.summary["trace"] = {
-                    "bytes": (out / "trace.rrd").stat().st_size,
-                    "us_per_frame": maker.us_per_frame,
-                }
+        self.summary |= maker.about
+        if maker.injected is not None:
+            self._injected = maker.injected
+            self._save_injected()
+        if maker.timing is not None:
+            self.summary["timing"] = maker.timing
+        if maker.us_per_frame is not None:
+            self.summary["trace"] = {
+                "bytes": (out / "trace.rrd").stat().st_size,
+                "us_per_frame": maker.us_per_frame,
+            }
         write_json(out / "summary.json", self.summary)
 
     def _save_injected(self) -> None:

@@ -6,7 +6,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ class Simulation:
 
     def __init__(self, begun: session.Session, scratch: Path) -> None:
         self._session = begun
-        self._clean = weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
+        self._clean = weakref.finalize(self, _end, begun.held, scratch)
         self._begun = False
 
     def __iter__(self) -> Iterator[Run]:
@@ -135,6 +135,12 @@ def _file(given: Given, file: Path) -> str:
         content["base"] = str(Path(base).absolute())
     write_text(file, toml.dumps(content))
     return str(file)
+
+
+def _end(held: ExitStack, scratch: Path) -> None:
+    """What a session holds until it has ended, or nobody can ask for its runs any more."""
+    held.close()
+    shutil.rmtree(scratch, ignore_errors=True)
 
 
 class _Noted(Silent):

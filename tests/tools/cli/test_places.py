@@ -8,6 +8,7 @@ import pytest
 
 from ato_hil.tools.cli import places
 from ato_hil.tools.cli.places import PlaceError
+from ato_hil.tools.runs.locks import LockedError
 
 
 @pytest.fixture(autouse=True)
@@ -125,3 +126,21 @@ def test_a_session_twice_and_over(ato_hil, short_text: str, tmp_path: Path) -> N
     assert "summary runs/short-cailc-sil/summary.json\n" in done.stdout
     assert (tmp_path / "runs/short-cailc-sil/summary.json").read_text() != before
     assert not (tmp_path / "runs/short-cailc-sil/unfinished").exists()
+
+
+def test_of_two_that_overwrite_the_second_is_refused() -> None:
+    out, record = Path("out"), Path("run.log")
+    out.mkdir()
+    fill(out, "old")
+    record.write_text("old")
+    with (
+        places.folder(out, "a", True) as place,
+        places.recording(record, True) as work,
+    ):
+        fill(place.work, "half")
+        assert work is not None
+        work.write_text("half")
+        for wanted in (places.folder(out, "a", True), places.recording(record, True)):
+            with pytest.raises(LockedError, match="another session, process"), wanted:
+                pass
+        assert (place.work / "summary.json").read_text() == work.read_text() == "half"
