@@ -40,7 +40,8 @@ RECEIVED = (
     TRAIN_SPEED,
     TRAIN_POSITION,
 )
-RUN_TICKS = 40  # of an adversarial run
+VARIANTS = 3  # of a calibration, in drive.c
+RUN_TICKS = 70  # of an adversarial run
 DATA_BITS = 48  # of a frame, behind its end-to-end header
 
 
@@ -75,10 +76,15 @@ def build(folder: Path, compiler: str, *flags: str) -> Path:
     return folder / "drive"
 
 
-def run(program: Path, words: np.ndarray, environment: dict[str, str] | None = None) -> str:
+def run(
+    program: Path,
+    words: np.ndarray,
+    environment: dict[str, str] | None = None,
+    variant: int = 0,
+) -> str:
     """What the program prints for these calls. Raises BuildError if it fails."""
     words.tofile(program.parent / "calls")
-    return call([str(program), "calls"], program.parent, environment).strip()
+    return call([str(program), "calls", str(variant)], program.parent, environment).strip()
 
 
 def words_of(made: Vectors) -> np.ndarray:
@@ -93,59 +99,72 @@ def words_of(made: Vectors) -> np.ndarray:
 
 
 def adversarial(count: int, seed: int) -> np.ndarray:
-    """So many calls with frames of any content, most of them protected as their receiver expects,
-    in short runs: a fault ends what can be seen of the others."""
+    """About so many calls with frames of any content, most of them protected as their receiver
+    expects, in short runs: a fault hides what others would do.
+
+    In a run a message keeps to quiet values or takes any; in some runs one stays away for a
+    while, or comes corrupt, or RUN_CTRL does not come again.
+    """
     random = np.random.default_rng(seed)
     counters = dict.fromkeys((RUN_CTRL.index, *(m.index for m in RECEIVED)), 0)
     words: list[int] = [1]
 
-    def frame(message: Any, data: int) -> tuple[int, int]:
+    def frame(message: Any, data: int, corrupt: bool = False) -> tuple[int, int]:
         counter = counters[message.index]
         counters[message.index] = (counter + 1) % e2e.COUNTER_PERIOD
-        if random.random() < 0.02:
-            counters[message.index] = int(random.integers(e2e.COUNTER_PERIOD))
-        word = int(e2e.protect(data, counter, message.data_id))
-        if random.random() < 0.01:
-            word ^= 1 << int(random.integers(63))
-        return message.index, word
+        data_id = message.data_id
+        if corrupt:
+            kind = random.integers(3)
+            counter = e2e.COUNTER_PERIOD if kind == 0 else counter
+            data_id ^= 0x100 if kind == 1 else 0  # its nibble in the frame
+            data ^= 0 if kind < 2 else 1 << 20
+        word = int(e2e.protect(data, counter, data_id))
+        return message.index, word ^ (1 << 30 if corrupt and kind == 2 else 0)
 
     def control(state: int, rate: int = 0) -> tuple[int, int]:
         fields = put(RUN_CTRL.RunState, state) + put(RUN_CTRL.TimetableRate, rate)
         return frame(RUN_CTRL, int(fields))
 
-    calls = tick = 0
+    calls = 0
     while calls < count:
-        place = tick % (RUN_TICKS + 2)
-        if place == 0:
-            rate = int(random.integers(-(1 << 23), 1 << 23)) if random.random() < 0.5 else 0
-            words += [0, 1, *control(ARMED, rate)]
-            held = [random.random() < 0.5 for _ in RECEIVED]  # what keeps to quiet values
-        elif place == 1:
-            words += [1, 1, *control(RUNNING)]
-        else:
-            frames = [
-                frame(m, _quiet(m, place) if quiet else _data(random))
-                for m, quiet in zip(RECEIVED, held, strict=True)
-                if random.random() < 0.97
-            ]
-            if place % 10 == 0:
-                ends = place == RUN_TICKS
-                frames.append(control(ENDED if ends else int(random.choice([RUNNING] * 9 + [5]))))
+        rate = int(random.integers(-(1 << 23), 1 << 23)) if random.random() < 0.5 else 0
+        words += [0, 1, *control(ARMED, rate), 1, 1, *control(RUNNING)]
+        share = random.choice([0.0, 0.0, 0.2, 1.0])  # of messages with any content
+        wild = [random.random() < share for _ in RECEIVED]
+        away = int(random.integers(4 * len(RECEIVED)))  # which one, if any
+        corrupt, since = int(random.integers(3 * len(RECEIVED))), int(random.choice([0, 1, 20]))
+        moves = int(random.integers(1 << 22)) if random.random() < 0.5 else 0
+        silent = random.random() < 0.2
+        for place in range(RUN_TICKS):
+            frames = []
+            for k, message in enumerate(RECEIVED):
+                if (k == away and 20 <= place < 45) or random.random() < 0.005:
+                    continue
+                if random.random() < 0.005:
+                    counters[message.index] = int(random.integers(e2e.COUNTER_PERIOD))
+                data = _data(random) if wild[k] else _quiet(message, place, moves)
+                bad = k == corrupt and since <= place < since + 7
+                frames.append(frame(message, data, bad))
+            if place == RUN_TICKS - 1:
+                frames.append(control(ENDED))
+            elif place % 10 == 9 and not silent:
+                frames.append(control(int(random.choice([RUNNING] * 19 + [5]))))
             words += [1, len(frames), *(word for one in frames for word in one)]
-        calls += 1
-        tick += 1
+        calls += RUN_TICKS + 2
     return np.array(words, np.int64)
 
 
-def _quiet(message: Any, place: int) -> int:
-    """A frame of a train that stands where it began, and of ATP that permits every speed."""
+def _quiet(message: Any, place: int, moves: int) -> int:
+    """A frame of a train that stands where it began, and of ATP that permits every speed; `moves`
+    other than 0: of one with that raw speed below 16 m/s, that accelerates, and may drive 8 m/s."""
     if message is TRAIN_POSITION:
         return int(put(TRAIN_POSITION.Tick, place))
     if message is ATP_LIMIT:
-        permitted = (1 << ATP_LIMIT.PermittedSpeed.length) - 1
-        return int(
-            put(ATP_LIMIT.PermittedSpeed, permitted) + put(ATP_LIMIT.TargetDistance, 65535)
-        )
+        permitted = 800 if moves else (1 << ATP_LIMIT.PermittedSpeed.length) - 1
+        return int(put(ATP_LIMIT.PermittedSpeed, permitted) + put(ATP_LIMIT.TargetDistance, 65535))
+    if message is TRAIN_SPEED and moves:
+        highest = (1 << (TRAIN_SPEED.Acceleration.length - 1)) - 1
+        return int(put(TRAIN_SPEED.Speed, moves) + put(TRAIN_SPEED.Acceleration, highest))
     return 0
 
 
@@ -160,4 +179,3 @@ def _data(random: np.random.Generator) -> int:
         bits = int(random.integers(1 << DATA_BITS))
     word = bits << 16
     return word - (1 << 64) if word >> 63 else word
-

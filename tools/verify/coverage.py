@@ -17,8 +17,6 @@ from typing import Any
 
 import msgspec
 
-from ato_hil.plant_sim.scenario import load, members
-from ato_hil.tools.export import vectors
 from ato_hil.tools.verify import calls, proof
 
 MODULES = ("can_dbc.e2e", "controller.guard", "controller.plausibility", "controller.memory")
@@ -27,10 +25,10 @@ FLAGS = ("-O0", "-fprofile-instr-generate", "-fcoverage-mapping", "-fcoverage-mc
 ADVERSARIAL, SEED = 5000, 1
 # Calibrations that differ in how the memory works and in what the guard does.
 PAIRS = (
-    ("subway", "cailc"),
-    ("crh3-learning", "afilc"),
-    ("crh3", "drac"),
-    ("gradient", "iplc"),
+    ("subway-atp:guarded", "cailc"),
+    ("crh3-learning-stretched", "afilc-track"),
+    ("gradient:I", "iplc"),
+    ("subway", "pid"),
 )
 
 # (function, text of the condition or line): why no call reaches it.
@@ -52,7 +50,9 @@ class Coverage:
         lines = [("statement", p, "") for p, hit in self.statements.items() if not hit]
         lines += [("branch", p, f" {way}") for (p, way), hit in self.branches.items() if not hit]
         lines += [
-            ("MC/DC", p, f" condition {k + 1}") for (p, k), hit in self.conditions.items() if not hit
+            ("MC/DC", p, f" condition {k + 1}")
+            for (p, k), hit in self.conditions.items()
+            if not hit
         ]
         return sorted(
             f"{kind} {place[0]}+{place[1]}: {place[3]}{what}"
@@ -79,19 +79,20 @@ def absent() -> str:
 
 
 def measure(pairs: Iterable[tuple[str, str]] = PAIRS) -> Coverage:
-    """Coverage over these scenarios and laws: first ticks of their runs, and adversarial calls.
-    Raises BuildError."""
+    """Coverage of adversarial calls over these scenarios and laws, and the variants of their
+    calibrations. Raises BuildError."""
     total = Coverage()
+    words = calls.adversarial(ADVERSARIAL, SEED)
     for scenario, law in pairs:
         made = proof.translated(scenario, law)
-        recorded = calls.words_of(vectors.record(members(load(scenario))[0], law))
         with tempfile.TemporaryDirectory(prefix="ato-hil-coverage-") as name:
             folder = Path(name)
             proof.write(made, folder)
             program = calls.build(folder, CLANG, *FLAGS)
-            for k, words in enumerate((recorded, calls.adversarial(ADVERSARIAL, SEED))):
-                calls.run(program, words, {"LLVM_PROFILE_FILE": f"{k}.raw"})
-            calls.call([PROFDATA, "merge", "-o", "all", "0.raw", "1.raw"], folder)
+            raw = [f"{variant}.raw" for variant in range(calls.VARIANTS)]
+            for variant, name in enumerate(raw):
+                calls.run(program, words, {"LLVM_PROFILE_FILE": name}, variant)
+            calls.call([PROFDATA, "merge", "-o", "all", *raw], folder)
             text = calls.call([COV, "export", "-instr-profile=all", str(program)], folder)
             source = (folder / "ato.c").read_text(encoding="utf-8").splitlines()
         ours = {
@@ -103,7 +104,9 @@ def measure(pairs: Iterable[tuple[str, str]] = PAIRS) -> Coverage:
     return total
 
 
-def _add(total: Coverage, functions: list[dict[str, Any]], ours: set[str], source: list[str]) -> None:
+def _add(
+    total: Coverage, functions: list[dict[str, Any]], ours: set[str], source: list[str]
+) -> None:
     for function in functions:
         name = function["name"].rpartition(":")[2]
         if name not in ours:
@@ -119,7 +122,7 @@ def _add(total: Coverage, functions: list[dict[str, Any]], ours: set[str], sourc
             return name, line - first, column, " ".join(" ".join(lines).split())[:80]
 
         for region in function["regions"]:
-            if region[7] == 0:
+            if region[7] == 0 and region[5] == 0:  # code, of no macro
                 _seen(total.statements, place(*region[:4]), region[4] > 0)
         for branch in function["branches"]:
             for way, hits in ((True, branch[4]), (False, branch[5])):

@@ -5,6 +5,10 @@
  * number of frames, and of each frame its mailbox and payload. Printed: calls, FNV-1a digest of the
  * frames sent and of the learning memory at the end; on a board also the fewest and the most
  * instructions of a call with period 1 and the bytes of stack used.
+ *
+ * Variants of the calibration, for what no scenario uses: 1 has a hold brake, a largest
+ * acceleration and speed, short windows of progress, a memory of three cells and of halves that
+ * smooths; 2 also a timetable that stands.
  */
 #include "ato.h"
 
@@ -26,6 +30,8 @@ static ato_state state;
 static ato_word cells[2 * ATO_CELLS * ATO_WORDS];
 static ato_mailbox rx[ATO_MESSAGE_COUNT];
 static ato_mailbox tx[ATO_MESSAGE_COUNT];
+static ato_params params;
+static const ato_segment STANDING[1] = { { INT32_MAX, 0 } };
 
 typedef struct {
     uint64_t digest;
@@ -45,12 +51,29 @@ static void digest(result *made, int64_t number)
     }
 }
 
-static result drive(const int64_t *words, size_t count)
+static result drive(const int64_t *words, size_t count, int variant)
 {
+    const ato_segment *profile = variant == 2 ? STANDING : ATO_PROFILE;
     result made = { UINT64_C(14695981039346656037), 0, UINT32_MAX, 0, 0 };
     size_t at = 1;
 
-    ato_init(&ATO_PARAMS[ATO_TRAIN], &state, cells);
+    params = ATO_PARAMS[ATO_TRAIN];
+    if (variant > 0) {
+        params.guard.hold_brake = -(1 << 26);
+        params.guard.acceleration_max = 1 << 26;
+        params.plausibility.speed_max = 1 << 28;
+        params.plausibility.window = 10;
+        params.memory.scale = 2;
+        params.memory.smooth = 3;
+        params.memory.smooth_weight = (1 << 30) / 7;
+        if (params.memory.cells > 3) {
+            params.memory.cells = 3;
+        }
+    }
+    if (variant == 2) {
+        params.reference.segment_count = 1;
+    }
+    ato_init(&params, &state, cells);
     while (at + 1 < count) {
         int64_t period = words[at];
         int64_t frames = words[at + 1];
@@ -66,7 +89,7 @@ static result drive(const int64_t *words, size_t count)
             rx[words[at]].fresh = 1;
         }
         start = board_start();
-        (void)ato_cycle(&ATO_PARAMS[ATO_TRAIN], ATO_PROFILE, &state, cells, rx, tx, period);
+        (void)ato_cycle(&params, profile, &state, cells, rx, tx, period);
         took = board_instructions(start);
         if (period == 1 && state.core.run_state == ATO_RUNNING) {
             if (took < made.fewest) {
@@ -106,7 +129,7 @@ int main(int argc, char **argv)
     if (words == NULL || fread(words, 1, (size_t)size, file) != (size_t)size || words[0] != 1) {
         return 2;
     }
-    made = drive(words, (size_t)size / sizeof *words);
+    made = drive(words, (size_t)size / sizeof *words, argc > 2 ? atoi(argv[2]) : 0);
     printf("%" PRIu32 " calls, digest %" PRIu64 "\n", made.calls, made.digest);
     free(words);
     return fclose(file) == 0 ? 0 : 2;
