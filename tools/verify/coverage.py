@@ -90,8 +90,8 @@ def measure(pairs: Iterable[tuple[str, str]] = PAIRS) -> Coverage:
             proof.write(made, folder)
             program = calls.build(folder, CLANG, *FLAGS)
             raw = [f"{variant}.raw" for variant in range(calls.VARIANTS)]
-            for variant, name in enumerate(raw):
-                calls.run(program, words, {"LLVM_PROFILE_FILE": name}, variant)
+            for variant, file in enumerate(raw):
+                calls.run(program, words, {"LLVM_PROFILE_FILE": file}, variant)
             calls.call([PROFDATA, "merge", "-o", "all", *raw], folder)
             text = calls.call([COV, "export", "-instr-profile=all", str(program)], folder)
             source = (folder / "ato.c").read_text(encoding="utf-8").splitlines()

@@ -45,7 +45,7 @@ def test_the_sanitizers_are_not_deaf(tmp_path: Path) -> None:
     assert wrong != text
     source.write_text(wrong, encoding="utf-8")
     program = calls.build(tmp_path, "gcc", *SANITIZERS)
-    with pytest.raises(calls.BuildError, match="runtime error|AddressSanitizer"):
+    with pytest.raises(calls.BuildError, match=r"runtime error|AddressSanitizer"):
         calls.run(program, calls.adversarial(100, seed=1))
 
 
