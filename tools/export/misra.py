@@ -264,7 +264,7 @@ def page(files: dict[str, str]) -> list[str]:
     lines = [
         "# MISRA C:2012",
         "",
-        "What is not listed here is kept as far as cppcheck's addon looks (it has most of the rules",
+        "What is not listed here is kept as far as cppcheck's addon looks (it has most rules",
         "that can be decided, not all). A reason holds for every place of a rule.",
         "",
     ]

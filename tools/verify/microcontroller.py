@@ -183,7 +183,8 @@ def page(laws: list[str]) -> Iterator[str]:
         path = ", ".join(m4.path)
         paths.setdefault(path, []).append(law)
     boards = " | ".join(f"instructions, {core}" for core in BOARDS)
-    yield f"| law | scenario | {boards} | cycles each | share | state | memory | stack | stack used |"
+    kept = "state | memory | stack | stack used"
+    yield f"| law | scenario | {boards} | cycles each | share | {kept} |"
     yield "| --- | --- | " + " | ".join(["---:"] * (len(BOARDS) + 6)) + " |"
     yield from rows
     yield ""

@@ -1,5 +1,5 @@
-"""What the exported firmware takes of a microcontroller: the emulator gives the host's bits, and the
-numbers are within the goal."""
+"""What the exported firmware takes of a microcontroller: the emulator gives the host's bits, and
+the numbers are within the goal."""
 
 import re
 import shutil
