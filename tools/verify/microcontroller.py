@@ -149,6 +149,7 @@ def page(laws: list[str]) -> Iterator[str]:
     yield ""
     rows, sizes = [], []
     notes: list[str] = []
+    least = float("inf")
     paths: dict[str, list[str]] = {}
     for law in laws:
         scenario = scenario_of(law)
@@ -167,6 +168,7 @@ def page(laws: list[str]) -> Iterator[str]:
         m4 = by_core["cortex-m4"]
         share = counted["cortex-m4"].most / (PERIOD_S * CLOCK_HZ)
         cycles = SHARE_MAX / share
+        least = min(least, cycles)
         if share > SHARE_MAX:
             notes.append(f"{law}: {share:.2%} of the period")
         if state > STATE_MAX:
@@ -188,8 +190,8 @@ def page(laws: list[str]) -> Iterator[str]:
     yield "| --- | --- | " + " | ".join(["---:"] * (len(BOARDS) + 6)) + " |"
     yield from rows
     yield ""
-    goal = "All laws are within the goal." if not notes else "Above the goal: " + "; ".join(notes)
-    yield f"{goal.rstrip('.')}."
+    goal = f"All laws are within the goal at up to {least:.1f} cycles an instruction"
+    yield f"{goal if not notes else 'Above the goal: ' + '; '.join(notes)}."
     yield ""
     yield from SIZES.format(libgcc=LIBGCC_STACK).splitlines()
     yield ""
