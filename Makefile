@@ -19,7 +19,7 @@ DEV_READY := .venv/dev.ready
 COMPILE := .venv/bin/python -m uv pip compile pyproject.toml --universal --generate-hashes --group build \
 	--no-header --no-annotate --no-emit-index-url --quiet
 
-.PHONY: help hil test long test-socketcan pil verify golden pareto figures pictures claims docs lint types lock clean
+.PHONY: help hil test long test-socketcan pil verify prove firmware-page golden pareto figures pictures claims docs lint types lock clean
 
 help: ## list the targets
 	sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 23
@@ -54,6 +54,14 @@ pil: $(DEV_READY) ## pass the tests on emulated microcontrollers; the golden run
 
 verify: $(RUN_READY) ## check every promise of the firmware: LAWS="cailc pid", all by default
 	.venv/bin/ato-hil verify $(LAWS)
+
+prove: $(RUN_READY) ## prove that no tick of the exported C overflows (Frama-C): LAWS="cailc pid", all by default
+	$(call install_tools,frama-c gcc,frama-c-base gcc)
+	.venv/bin/ato-hil verify --prove $(LAWS)
+
+firmware-page: $(RUN_READY) ## write docs/firmware.md again: flash, RAM, stack, instructions, coverage of the exported C
+	$(call install_tools,arm-none-eabi-gcc qemu-system-arm clang-19 llvm-cov-19,gcc-arm-none-eabi qemu-system-arm clang-19 llvm-19 libclang-rt-19-dev)
+	.venv/bin/python -m ato_hil.tools.verify.microcontroller $(LAWS)
 
 golden: $(RUN_READY) ## write new golden digests (tools/verify/golden.json) and say what changed
 	.venv/bin/ato-hil verify --renew-golden $(LAWS)
@@ -145,6 +153,23 @@ missing=
 command -v qemu-system-arm >/dev/null || missing+=" qemu-system-arm"
 command -v arm-none-eabi-gcc >/dev/null || missing+=" gcc-arm-none-eabi"
 $(call install_missing)
+endef
+
+# Packages of Debian where one of these programs is missing.
+define install_tools
+for tool in $(1); do
+	if ! command -v "$$tool" >/dev/null; then
+		if [ "$$(id -u)" != 0 ] || ! command -v apt-get >/dev/null; then
+			echo "$$tool is missing. Install it, then run make again:" \
+				"sudo apt-get install -y $(2)" >&2
+			exit 1
+		fi
+		echo "Installing $(2)"
+		apt-get update -qq
+		DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(2) >/dev/null
+		break
+	fi
+done
 endef
 
 define install_guest

@@ -50,6 +50,7 @@ NODATA, INIT, VALID, INVALID = 0, 1, 2, 3
 
 WINDOW = 16  # WindowSize, checks
 AGE_MAX = 1 << 20  # ticks, where the age of a link stops
+LOST_MAX = (1 << 31) - 1  # frames, where their count stops
 
 # What a receiver tolerates: MaxDeltaCounter, and MinOkState... and MaxErrorState... of the state
 # machine.
@@ -83,6 +84,17 @@ LINK = np.dtype(
     ],
     align=True,
 )
+LINK_BOUNDS = {
+    "counter": (-1, 15),
+    "age": (0, AGE_MAX),
+    "lost": (0, LOST_MAX),
+    "check": (OK, WRONG_SEQUENCE),
+    "state": (NODATA, INVALID),
+    "ok_count": (0, WINDOW),
+    "error_count": (0, WINDOW),
+    "ok_window": (0, (1 << WINDOW) - 1),
+    "error_window": (0, (1 << WINDOW) - 1),
+}
 
 
 def _crc_table() -> np.ndarray:
@@ -210,7 +222,7 @@ def receive(setting: Any, link: Any, mailbox: Any, data_id: Any) -> Any:
         if found != CORRUPT:
             link.counter = (word >> 8) & 15
         if found != OK:
-            link.lost = int64(link.lost) + 1
+            link.lost = min(int64(link.lost) + 1, int64(LOST_MAX))
     good = is_good(found)
     link.age = int64(0) if good != 0 else min(int64(link.age) + 1, int64(AGE_MAX))
     link.check = found
@@ -250,8 +262,10 @@ def supervise(setting: Any, link: Any, found: Any) -> None:
 def count(link: Any, good: Any, bad: Any) -> None:
     """The window one check further: the oldest check leaves it."""
     window = int64(link.ok_window)
-    link.ok_count = int64(link.ok_count) + good - ((window >> (WINDOW - 1)) & 1)
+    counted = int64(link.ok_count) + good - ((window >> (WINDOW - 1)) & 1)
+    link.ok_count = min(max(counted, int64(0)), int64(WINDOW))  # as the window has it
     link.ok_window = ((window << 1) | good) & ((1 << WINDOW) - 1)
     window = int64(link.error_window)
-    link.error_count = int64(link.error_count) + bad - ((window >> (WINDOW - 1)) & 1)
+    counted = int64(link.error_count) + bad - ((window >> (WINDOW - 1)) & 1)
+    link.error_count = min(max(counted, int64(0)), int64(WINDOW))
     link.error_window = ((window << 1) | bad) & ((1 << WINDOW) - 1)

@@ -11,6 +11,7 @@ stores the learning memory, nothing else.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,7 @@ from ato_hil.controller.interface import (
     TRACTION,
 )
 from ato_hil.controller.q import (
+    INT32_MAX,
     Q_ACCELERATION,
     Q_FORCE,
     Q_POSITION,
@@ -140,6 +142,15 @@ CORE_STATE = np.dtype(
 )
 
 
+CORE_BOUNDS = {
+    "run_state": (IDLE, ENDED),
+    "tick": (0, INT32_MAX),
+    "map_section": (0, gradient_map.SECTIONS_MAX),
+    "stamp": (0, TICK_MASK),
+    "sent": (0, e2e.COUNTER_PERIOD - 1),
+}
+
+
 def params_dtype(law_params: np.dtype) -> np.dtype:
     """PARAMS of the whole firmware around those of a law."""
     return np.dtype(
@@ -182,6 +193,24 @@ def state_dtype(law_state: np.dtype) -> np.dtype:
         ],
         align=True,
     )
+
+
+def state_bounds(
+    law: Mapping[str, tuple[int, int]], params: Any
+) -> dict[str, Mapping[str, tuple[int, int]]]:
+    """Bounds that every tick keeps, by part of the state and field; a field without holds what its
+    type holds. `law` its STATE_BOUNDS, `params` one record of its `params_dtype`."""
+    cursor = reference.cursor_bounds(params["reference"])
+    return {
+        "core": CORE_BOUNDS,
+        "links": e2e.LINK_BOUNDS,
+        "plausibility": plausibility.STATE_BOUNDS,
+        "cursor": cursor,
+        "ahead": cursor,
+        "rebasing": rebasing.STATE_BOUNDS,
+        "memory": memory.state_bounds(params["memory"]),
+        "law": law,
+    }
 
 
 @step
@@ -512,7 +541,7 @@ def after_law(params: Record, profile: Array, state: Record, cells: Array, tx: A
     send(params, state, tx)
     reference.advance(params.reference, state.cursor, profile)
     reference.advance(params.reference, state.ahead, profile)
-    core.tick = int64(core.tick) + 1
+    core.tick = min(int64(core.tick) + 1, int64(INT32_MAX))  # after 248 days
 
 
 @step

@@ -22,6 +22,8 @@ Contract: `gather` and `scatter` are steps of bounded time that run inside the t
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ato_hil.can_dbc.step import (
@@ -92,6 +94,24 @@ MEMORY_STATE = np.dtype(
     align=True,
 )
 
+TOTAL_MAX = 1 << 48  # where the sum of a cell that no longer closes stops
+
+
+def state_bounds(params: Any) -> dict[str, tuple[int, int]]:
+    """Bounds of MEMORY_STATE with one record of MEMORY_PARAMS, by field."""
+    cells, decimation = max(int(params["cells"]), 1), max(int(params["decimation"]), 1)
+    widest = (2 * int(params["smooth"]) + 1) << 31
+    return {
+        "total": (-TOTAL_MAX, TOTAL_MAX),
+        "window": (-widest, widest),
+        "generation": (0, 1),
+        "read_cell": (0, cells - 1),
+        "read_phase": (0, ONE if int(params["pitch"]) > 0 else decimation - 1),
+        "write_cell": (0, cells),
+        "write_phase": (0, decimation),
+        "wait": (0, max(int(params["lead"]), 0)),
+    }
+
 
 @step
 def rewind(params: Record, state: Record, memory: Array, cell: Record) -> None:
@@ -124,7 +144,8 @@ def slide(params: Record, state: Record, memory: Array, here: Int) -> None:
     last = int64(params.cells) - 1
     enters = int64(memory[generation, clamp(here + half, int64(0), last), word])
     leaves = int64(memory[generation, clamp(here - 1 - half, int64(0), last), word])
-    state.window = int64(state.window) + enters - leaves
+    most = (2 * half + 1) << 31
+    state.window = clamp(int64(state.window) + enters - leaves, -most, most)
 
 
 @step
@@ -147,7 +168,8 @@ def gather_along(params: Record, state: Record, memory: Array, cell: Record, pos
     place = clamp(position, int64(0), last * pitch)
     here = place // max(pitch, int64(1))
     ahead = min(here + 1, last)
-    delta = ((place - here * pitch) << 30) // max(pitch, int64(1))  # of the cell ahead, below 1
+    delta = ((place - here * pitch) << 30) // max(pitch, int64(1))  # of the cell ahead
+    delta = clamp(delta, int64(0), int64(ONE))
     live = 1 - int64(state.generation)
     for w in range(WORDS_MAX):
         if w < int64(params.words):
@@ -227,9 +249,12 @@ def scatter(params: Record, state: Record, memory: Array, cell: Record) -> None:
         else:
             for w in range(WORDS_MAX):
                 if w < words:
-                    state.total[w] = int64(state.total[w]) + int64(cell.learn[w])
-            state.write_phase = int64(state.write_phase) + 1
-            if int64(state.write_phase) >= int64(params.decimation):
+                    total = int64(state.total[w]) + int64(cell.learn[w])
+                    state.total[w] = clamp(total, -int64(TOTAL_MAX), int64(TOTAL_MAX))
+            decimation = int64(params.decimation)
+            # Behind the last cell it stays full.
+            state.write_phase = min(int64(state.write_phase) + 1, decimation)
+            if int64(state.write_phase) >= decimation:
                 close_cell(params, state, memory)
 
 

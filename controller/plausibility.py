@@ -70,6 +70,13 @@ STATE = np.dtype(
 )
 
 TICKS_MAX = 1 << 16  # where the ages of the samples stop; a link is lost long before
+TRAVELLED_MAX = 1 << 50  # where the sum stops, far outside of what a window can hold
+STATE_BOUNDS = {
+    "travelled": (-TRAVELLED_MAX, TRAVELLED_MAX),
+    "ticks": (0, TICKS_MAX),
+    "speed_ticks": (0, TICKS_MAX),
+    "position_ticks": (0, TICKS_MAX),
+}
 
 
 def reaction_ticks(params: Any, wrong_m_s: float) -> int | None:
@@ -163,9 +170,9 @@ def faults_of_progress(
     faults = int64(0)
     is_first = int64(state.position_ticks) == 0
     if not is_first:
-        # Q24 * Q30, below 2^32 * 2^27; the sum stops far outside of what a window can hold.
+        # Q24 * Q30, below 2^32 * 2^27.
         passed = ((int64(state.before) + speed) * int64(params.period)) >> 31
-        most = int64(1) << 50
+        most = int64(TRAVELLED_MAX)
         state.travelled = min(max(int64(state.travelled) + passed, -most), most)
         state.ticks = min(int64(state.ticks) + 1, int64(TICKS_MAX))
         apart = position - int64(state.start) - (int64(state.travelled) >> 9)

@@ -81,6 +81,10 @@ STATE = np.dtype(
     ],
     align=True,
 )
+STATE_BOUNDS = {
+    "offset": (-OFFSET_MAX, OFFSET_MAX),
+    "offset_speed": (-OFFSET_SPEED_MAX, OFFSET_SPEED_MAX),
+}
 
 
 class RebasingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -16,6 +16,8 @@ cursor stays where it is.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ato_hil.can_dbc.step import (
@@ -25,7 +27,7 @@ from ato_hil.can_dbc.step import (
     int64,
     step,
 )
-from ato_hil.controller.q import round_shift, sat32
+from ato_hil.controller.q import INT32_MAX, clamp, round_shift, sat32
 
 SEGMENT = np.dtype([("ticks", np.int32), ("jerk", np.int32)], align=True)
 
@@ -45,6 +47,8 @@ CURSOR = np.dtype(
     align=True,
 )
 
+# A cursor stops there, far outside of what a position, speed or acceleration holds.
+X_MAX, V_MAX, A_MAX = 1 << 58, 1 << 47, 1 << 38
 # What turns a cursor into the firmware's Q formats: SI = integer * 2^-40, scaled by powers of 1/Ts.
 REFERENCE_PARAMS = np.dtype(
     [
@@ -59,6 +63,19 @@ REFERENCE_PARAMS = np.dtype(
 PREVIEW_MAX = 128
 Q_RATE = 24
 ONE = 1 << Q_RATE
+
+
+def cursor_bounds(params: Any) -> dict[str, tuple[int, int]]:
+    """Bounds of CURSOR with one record of REFERENCE_PARAMS, by field."""
+    return {
+        "x": (-X_MAX, X_MAX),
+        "v": (-V_MAX, V_MAX),
+        "a": (-A_MAX, A_MAX),
+        "segment": (0, max(int(params["segment_count"]) - 1, 0)),
+        "left": (0, INT32_MAX),
+        "phase": (0, ONE - 1),
+        "rate": (-(ONE >> 1), ONE >> 1),
+    }
 
 
 @step
@@ -93,9 +110,9 @@ def next_tick(params: Record, cursor: Record, profile: Array) -> None:
         x = int64(cursor.x)
         v = int64(cursor.v)
         a = int64(cursor.a)
-        cursor.x = x + 3 * (v + a) + jerk
-        cursor.v = v + 2 * a + jerk
-        cursor.a = a + jerk
+        cursor.x = clamp(x + 3 * (v + a) + jerk, -int64(X_MAX), int64(X_MAX))
+        cursor.v = clamp(v + 2 * a + jerk, -int64(V_MAX), int64(V_MAX))
+        cursor.a = clamp(a + jerk, -int64(A_MAX), int64(A_MAX))
         left = int64(cursor.left) - 1
         if left == 0:
             cursor.jerk = 0

@@ -158,6 +158,7 @@ def errors(params: Record, state: Record, inputs: Record) -> Int:
 def increments(params: Record, chi: Int, speed: Int, cell: Record) -> None:
     """cell.learn = Gamma xi chi / M with xi = [-1, -v, -v^2]; chi Q24, v Q22."""
     chi_v = round_shift(chi * speed, 22)
+    chi_v = clamp(chi_v, 1 - (int64(1) << 36), (int64(1) << 36) - 1)  # times speed below 2^63
     # Beyond 2^37 (8192 m^3/s^3) every theta is at its bound anyway; the product with Gamma stays
     # below 2^63.
     chi_v2 = clamp(round_shift(chi_v * speed, 22), -(int64(1) << 37), int64(1) << 37)

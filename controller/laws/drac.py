@@ -370,7 +370,7 @@ def adapting_error(params: Record, model: Record, b: Int, z2: Int) -> Int:
         square = (int64(model.psi[i]) * int64(model.psi[i])) >> 24  # Q36, at most 2^30
         load += round_shift(square * int64(params.rate[i]), 24)
     # Ts w_a^2 / (Ts wmax2), Q28; at 64 the cap divides by thousands, more makes no difference.
-    ratio = round_shift(min(load, int64(1) << 33) * int64(params.cap), 16)
+    ratio = round_shift(clamp(load, int64(0), int64(1) << 33) * int64(params.cap), 16)
     return (limited << 32) // max((int64(1) << 28) + ratio, int64(1))
 
 

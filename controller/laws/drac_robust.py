@@ -191,7 +191,7 @@ def weighted(params: Record, model: Record) -> Int:
     for i in range(3):
         square = (int64(model.eta[i]) * int64(model.eta[i])) >> 22
         total += int64(params.weight[i]) * square
-    return round_shift(total, 24)
+    return max(round_shift(total, 24), int64(0))
 
 
 @step
@@ -210,6 +210,7 @@ def smooth(params: Record, model: Record, ball: Record) -> Int:
     )
     for i in range(3):
         along = round_shift(int64(params.weight[i]) * int64(model.eta[i]), 24)  # Q26
+        along = clamp(along, 1 - int64(ETA_MAX), int64(ETA_MAX) - 1)
         ball.change[i] = sat32(int64(ball.change[i]) - round_shift(ratio * along, 28))
     return int64(1)
 
@@ -224,7 +225,7 @@ def towards(params: Record, model: Record, excess: Int) -> None:
     for i in range(3):
         eta = int64(model.eta[i])
         part = min(round_shift(lam * int64(params.weight[i]), 24), int64(1) << 28)
-        model.eta[i] = eta - round_shift(part * eta, 28)
+        model.eta[i] = bounded(eta - round_shift(part * eta, 28))
 
 
 @step

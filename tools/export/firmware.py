@@ -342,7 +342,9 @@ def header_file(made: Translated) -> str:
     )
     text = reflowed(text)
     law_text = f"The law, {source_of(law.module).file}:\n\n{inspect.getdoc(law.module) or ''}"
-    bounds = law.STATE_BOUNDS
+    parts: Any = state.fields
+    stated = firmware.state_bounds(law.STATE_BOUNDS, fw.first.params[0])
+    bounds = {made.records.name(parts[name][0].base): part for name, part in stated.items()}
     lines = [
         *top(fw, text),
         "#ifndef ATO_H",

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from ato_hil.plant_sim.scenario import load, members
-from ato_hil.tools.export import ExportError, firmware, vectors
+from ato_hil.tools.export import ExportError, firmware, misra, vectors
 from ato_hil.tools.export.firmware import Firmware, Translated
 from ato_hil.tools.runs import onboard
 
@@ -20,6 +20,7 @@ FILES = (
     "ato_vectors.h",
     "ato_selftest.c",
     "CMakeLists.txt",
+    "MISRA.md",
 )
 
 
@@ -33,12 +34,15 @@ def files(scenario: str, law: str | None) -> dict[str, str]:
     fw = Firmware(loaded.name, [onboard.calibration_for(train, law) for train in trains])
     made = Translated(fw)
     source = firmware.source_file(made)  # names the records that the header defines
-    recorded = vectors.record(trains[0], law)
-    first = ["The first ticks of two runs: frames in, frames out, digest."]
-    return {
+    sources = {
         "ato.h": firmware.header_file(made),
         "ato.c": source,
         "ato_config.c": firmware.config_file(made),
+    }
+    recorded = vectors.record(trains[0], law)
+    first = ["The first ticks of two runs: frames in, frames out, digest."]
+    return {
+        **sources,
         "ato_can.h": firmware.can_file(fw),
         "ato_vectors.h": firmware.text_of(
             [*firmware.top(fw, first[0]), '#include "ato.h"', "", *vectors.header(recorded)]
@@ -50,6 +54,7 @@ def files(scenario: str, law: str | None) -> dict[str, str]:
             ]
         ),
         "CMakeLists.txt": firmware.cmake_file(fw),
+        "MISRA.md": firmware.text_of(misra.page(sources)),
     }
 
 

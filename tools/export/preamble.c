@@ -8,7 +8,7 @@ static int64_t min64(int64_t a, int64_t b) { return b < a ? b : a; }
 static int64_t max64(int64_t a, int64_t b) { return b > a ? b : a; }
 static int64_t abs64(int64_t a) { return a < 0 ? -a : a; }
 
-/* Python's `//` rounds down where C rounds towards 0; a divisor of 0 gives 0. */
+/* Python's division rounds down where C rounds towards 0; a divisor of 0 gives 0. */
 static int64_t floor_div(int64_t a, int64_t b)
 {
     int64_t quotient;

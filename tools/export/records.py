@@ -74,20 +74,20 @@ class Records:
         """Comments of a record's fields."""
         return self._comments.get(tuple(dtype.names or ()), {})
 
-    def structs(self, bounds: Mapping[str, tuple[int, int]]) -> Iterator[str]:
-        """Lines that define all records; `bounds` of fields that a law states."""
+    def structs(self, bounds: Mapping[str, Mapping[str, tuple[int, int]]]) -> Iterator[str]:
+        """Lines that define all records; `bounds` of fields, by record."""
         for name, dtype in self.made.items():
             home = self._homes[dtype]
             if home:
                 yield from comment_lines("", home)
             yield "typedef struct {"
-            comments = self.comments(dtype)
+            comments, within = self.comments(dtype), bounds.get(name, {})
             for field, item, gap in fields_of(dtype):
                 if gap:
                     yield f"    uint8_t {field}[{gap}];"
                     continue
                 declared = self.field(field, item)
-                note = comment_text(described(comments.get(field, ""), item, bounds.get(field)))
+                note = comment_text(described(comments.get(field, ""), item, within.get(field)))
                 line = f"    {declared};"
                 if note and len(line) + len(note) + 7 <= 100:
                     yield f"{line} /* {note} */"
@@ -134,8 +134,8 @@ def described(comment: str, item: np.dtype, bounds: tuple[int, int] | None) -> s
     if base.names or base.kind != "i":
         return comment
     if bounds is not None:
-        q = int(found[1]) if found else 0
-        return f"{comment}; {bounds[0] / 2**q:.6g} to {bounds[1] / 2**q:.6g}"
+        low, high = (f"{b / 2 ** int(found[1]):.6g}" if found else f"{b}" for b in bounds)
+        return f"{comment.rstrip('.')}; {low} to {high}".lstrip("; ")
     if found is None or len(FORMAT.findall(comment)) > 1:
         return comment
     limit = 2.0 ** (8 * base.itemsize - 1 - int(found[1]))

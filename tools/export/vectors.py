@@ -40,7 +40,7 @@ class Vectors:
             self.digest = (self.digest ^ byte) * FNV_PRIME & (2**64 - 1)
 
 
-def record(loaded: Loaded, law: str) -> Vectors:
+def record(loaded: Loaded, law: str, ticks_max: int = TICKS, runs: int = RUNS) -> Vectors:
     """Vectors of the first train; those of a line go on without answers of the others."""
     node = onboard.controllers_for([loaded], law)[0]
     here = world.build(loaded, SEED)
@@ -62,12 +62,12 @@ def record(loaded: Loaded, law: str) -> Vectors:
         plant.announce(here.state[0]["node"], state, run, here.tx[0])
         call(0, here.tx[0])
 
-    for run in onboard.run_numbers(law, RUNS):
+    for run in onboard.run_numbers(law, runs):
         here.prepare(run)
         announce(plant.ARMED, run)
         here.begin(here.params, here.state)
         chance = world.chances(here, run)
-        ticks = min(TICKS, chance.shape[1])
+        ticks = min(ticks_max, chance.shape[1])
         truth = world.rows(np.zeros(chance.shape, plant.TRUTH))
         for tick in range(ticks):
             for train in range(len(here.members)):

@@ -23,6 +23,7 @@ from ato_hil.tools.verify import (
     ir,
     native,
     overflow,
+    proof,
     row,
 )
 
@@ -42,7 +43,22 @@ def run(laws: list[str], fast: bool) -> Iterator[Row]:
     names = laws or law_names()
     for name in names:
         load_law(name)
-    for one in _checks(names, fast):
+    yield from _until_one_fails(_checks(names, fast))
+
+
+def prove(laws: list[str]) -> Iterator[Row]:
+    """Rows of the proof for these laws, all if none is named; ends with the first that failed.
+
+    Raises LawError, ScenarioError, ExportError with one line.
+    """
+    names = laws or law_names()
+    for name in names:
+        load_law(name)
+    yield from _until_one_fails(one for name in names for one in proof.check(name))
+
+
+def _until_one_fails(rows: Iterator[Row]) -> Iterator[Row]:
+    for one in rows:
         yield one
         if one.state not in (PASSED, ABSENT):
             return
