@@ -16,7 +16,7 @@ from ato_hil.tools.cli.console import (
     say,
     sigterm_as_ctrl_c,
 )
-from ato_hil.tools.cli.options import Picture, ScenarioName
+from ato_hil.tools.cli.options import SEED_MAX, Picture, ScenarioName
 from ato_hil.tools.cli.output import console
 
 
@@ -49,7 +49,7 @@ def profile(
     run: Annotated[
         int, typer.Option(min=0, help="Run whose timetable to print; 0: as planned.")
     ] = 0,
-    seed: Annotated[int, typer.Option(help="Seed of that run.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Seed of that run.")] = 1,
 ) -> None:
     """Print the reference profile and the limit of each control period as CSV, for nodes of your
     own."""

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli import buses, clean, compare, export, look, prove, run
+from ato_hil.tools.cli import buses, clean, compare, export, look, prove, run, scenarios
 from ato_hil.tools.cli.options import Viewer
 from ato_hil.tools.cli.output import ignore_other_tools, streams
 
@@ -26,6 +26,8 @@ COMMANDS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("figures", look.figures),
         ("report", look.report),
         ("list", look.list_scenarios),
+        ("show", scenarios.show),
+        ("new", scenarios.new),
         ("doctor", buses.doctor),
         ("clean", clean.clean),
     ),
