@@ -107,7 +107,7 @@ claims: $(RUN_READY) ## measure what the papers claim again, and write it into d
 	done
 	.venv/bin/python -m ato_hil.tools.cli.docs runs/claims/*.json
 
-docs: $(RUN_READY) ## write docs/messages.md and docs/command-line.md again, from DBC and program
+docs: $(RUN_READY) ## write docs/messages.md, command-line.md and scenario.md again, from DBC and program
 	.venv/bin/python -m ato_hil.tools.cli.docs
 
 # The viewer draws them without a screen, with Vulkan in software: mesa-vulkan-drivers is for this.

@@ -36,7 +36,7 @@ def validation(error: msgspec.ValidationError, kind: Any) -> tuple[str, str]:
     text, _, place = str(error).partition(" - at `$")
     place = place.rstrip("`")
     if unknown := UNKNOWN_FIELD.fullmatch(text):
-        known = _fields(msgspec.inspect.type_info(kind), re.findall(r"\w[\w-]*|\[", place))
+        known = _fields(msgspec.inspect.type_info(kind), re.findall(r"\[[^]]*\]|\w[\w-]*", place))
         text = f"{text}, {expected(unknown[1], known)}" if known else text
     return text, place
 

@@ -26,7 +26,6 @@ Cost: 1 µs a frame in a node with rules, and 4 µs for each rule that draws; no
 from __future__ import annotations
 
 import struct
-import tomllib
 from collections.abc import Callable, Collection, Sequence
 from functools import cache, partial
 from hashlib import blake2b
@@ -36,7 +35,7 @@ from typing import Annotated, Any, NamedTuple, get_args
 
 import msgspec
 
-from ato_hil.can_dbc import e2e
+from ato_hil.can_dbc import e2e, settings
 from ato_hil.can_dbc.codec import (
     INDEX_OF_FRAME_ID,
     MESSAGES,
@@ -55,7 +54,8 @@ WIRE_FRAMES = 37  # of 135 bits that 500 kbit/s carry in 10 ms
 
 Frame = tuple[int, int]  # identifier and payload, as ato_hil.can_dbc.bus moves them
 Seconds = Annotated[float, msgspec.Meta(ge=0)]
-Tick = Annotated[int, msgspec.Meta(ge=0)]
+Tick = Annotated[int, msgspec.Meta(ge=0, le=2**31)]
+RunNumber = Annotated[int, msgspec.Meta(ge=0, le=4095)]  # as RUN_CTRL carries it
 Few = Annotated[int, msgspec.Meta(ge=0, le=10_000)]
 Count = Annotated[int, msgspec.Meta(ge=1, le=10_000)]
 Bits = Annotated[int, msgspec.Meta(ge=1, le=16)]
@@ -84,8 +84,16 @@ class Window(
     to_s: Seconds = float("inf")
     from_tick: Tick = 0
     to_tick: Tick | None = None
-    runs: tuple[int, ...] = ()  # their numbers; none: all
+    runs: tuple[RunNumber, ...] = ()  # their numbers; none: all
     train: Annotated[int, msgspec.Meta(ge=1)] | None = None  # of a line, 1 leads; none: all
+
+    def __post_init__(self) -> None:
+        if self.to_s <= self.from_s:
+            raise ValueError(f"to is {self.to_s:g}, expected more than from, {self.from_s:g}")
+        if self.to_tick is not None and self.to_tick <= self.from_tick:
+            raise ValueError(
+                f"to_tick is {self.to_tick}, expected more than from_tick, {self.from_tick}"
+            )
 
 
 def ticks_of(window: Window, period_s: float) -> tuple[int, float]:
@@ -103,6 +111,7 @@ class BusFault(Window, frozen=True, kw_only=True):
     at: str | None = None  # the receiving node; none: both
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.at is not None and self.at not in RECEIVERS:
             raise ValueError(f"at is {self.at!r}, expected {' or '.join(RECEIVERS)}")
 
@@ -216,7 +225,7 @@ class ProcessEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     node: str  # plant, recorder, controller; of a line controller-1, controller-2, …
     signal: str
     at_s: Seconds  # of the run
-    run: int = 1
+    run: RunNumber = 1
 
     def __post_init__(self) -> None:
         if self.signal not in SIGNALS:
@@ -278,24 +287,26 @@ def load_signals(path: Path, nodes: Collection[str], period_s: float) -> list[Pr
 def table(path: Path, name: str, kind: Any) -> list[Any]:
     """The entries of one table of the file, each a `kind`. Raises FaultError with one line."""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FaultError(f"{path}: not valid TOML: {error}") from None
-    except OSError as error:
-        raise FaultError(f"{path}: cannot be read: {error.strerror}") from None
+        content = settings.read_toml(path)
+    except ValueError as error:
+        raise FaultError(f"{path}: {error}") from None
     for key in content:
         if key not in TABLES:
             known = expected(f"[[{key}]]", (f"[[{each}]]" for each in TABLES))
             raise FaultError(f"{path}: key {key}: {known}")
+    entries = content.get(name, [])
     try:
-        entries: list[Any] = msgspec.convert(content.get(name, []), list[kind])
+        converted: list[Any] = msgspec.convert(entries, list[kind])
     except msgspec.ValidationError as error:
         text, place = validation(error, list[kind])
         if place.endswith(".kind"):
             given = text.partition("'")[2].rstrip("'")
             text += f", {expected(given, _kinds(kind))}"
         raise FaultError(f"{path}: key {name}{place}: {text}") from None
-    return entries
+    strange = settings.strange_number(entries, name)
+    if strange:
+        raise FaultError(f"{path}: key {strange.key}: {strange.text}")
+    return converted
 
 
 def save(plan: Plan, file: Path, folder: Path) -> None:

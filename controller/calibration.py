@@ -155,6 +155,7 @@ def calibrate(
         typed = msgspec.convert(gains, known.Gains)
         with np.errstate(invalid="raise"):  # a float that no integer holds
             params["law"] = _law(known, known.calibrate(typed, vehicle))
+            _check_spacing(typed, line)
             words = _words(known, typed, vehicle)
         recall = _recalled(known, typed, int(words["words"][0]))
         pitch_m = _pitch_m(known, typed)
@@ -197,6 +198,17 @@ def calibrate(
         except CalibrationError as error:
             raise CalibrationError(f"train.{error}") from None
     return Calibration(law, scenario_digest, params, profile, memory_settings.storage)
+
+
+def _check_spacing(gains: Any, line: Line | None) -> None:
+    """Raises CalibrationError if trains begin where the law's potential is to keep them from."""
+    if line is None or not hasattr(gains, "l1_m"):
+        return
+    if not gains.l1_m < line.spacing_m < gains.l2_m:
+        raise CalibrationError(
+            f"l1_m, l2_m are {gains.l1_m:g}, {gains.l2_m:g}, expected line.spacing_m,"
+            f" {line.spacing_m:g}, between them"
+        )
 
 
 def _guard(settings: GuardSettings, period_s: float) -> np.ndarray:

@@ -18,6 +18,8 @@ without neighbours.
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import msgspec
 import numpy as np
 
@@ -88,7 +90,7 @@ STATE = np.dtype(
 class NeighbourSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What the controller makes of its neighbours' data."""
 
-    age_max_s: float = 1.5  # older data do not count
+    age_max_s: Annotated[float, msgspec.Meta(gt=0)] = 1.5  # older data do not count
 
 
 def calibrate(

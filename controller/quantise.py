@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
 
 from ato_hil.can_dbc.errors import InputError
+
+# A gain that pulls the train back where it belongs; with the other sign no loop is stable.
+Gain = Annotated[float, msgspec.Meta(ge=0)]
 
 
 class CalibrationError(InputError):
@@ -41,6 +47,12 @@ class Recall:
     smooth_word: int  # the word of which it sees a moving average
     smooth_ticks: int  # ticks either side that the average takes in
     late_word: int  # words from here on belong to the tick before the one that gives them
+
+
+def check_bounds(key: str, low: float, high: float) -> None:
+    """Raises ValueError if the lower bound is above the upper one."""
+    if low > high:
+        raise ValueError(f"{key}: {low:g} to {high:g}, expected the lower bound first")
 
 
 def fixed(key: str, value: float, q: int, bits: int = 32) -> int:

@@ -29,6 +29,7 @@ Contract: `follow` is a step of bounded time.
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -43,7 +44,10 @@ from ato_hil.can_dbc.step import (
 from ato_hil.controller import separation
 from ato_hil.controller.interface import AHEAD, BEHIND, SIDES
 from ato_hil.controller.q import clamp, round_shift, sat32
-from ato_hil.controller.quantise import fixed
+from ato_hil.controller.quantise import CalibrationError, fixed
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 STANDSTILL = 1 << 14  # m/s, Q24: 1 mm/s
 Q_OFFSET = 40  # m
@@ -90,26 +94,26 @@ STATE_BOUNDS = {
 class RebasingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """When a train leaves its timetable, and how it moves then."""
 
-    error_max_m: float  # of the train against its timetable; below the bound of the law's barrier
-    separation_max_m: float = 2.0  # of a distance against S0
-    l1_m: float  # least distance of two trains
-    l2_m: float  # largest
-    d: float = 1e7  # m^4/s^2, of the separation's potential
-    separation_max_m_s2: float = 0.8  # its share of a_r
-    consensus_1_s: float = 1.0  # h
-    emergency_brake_m_s2: float = 1.0  # a_e
-    brake_max_m_s2: float = 1.2  # -a_min
-    traction_max_m_s2: float = 0.8  # a_max
-    speed_max_m_s: float  # v_max
-    return_gain_1_s2: float = 0.001  # g
-    return_within_m: float = 20.0
+    error_max_m: Positive  # against its timetable; below the bound of the law's barrier
+    separation_max_m: Positive = 2.0  # of a distance against S0
+    l1_m: Positive  # least distance of two trains
+    l2_m: Positive  # largest
+    d: NotNegative = 1e7  # m^4/s^2, of the separation's potential
+    separation_max_m_s2: NotNegative = 0.8  # its share of a_r
+    consensus_1_s: NotNegative = 1.0  # h
+    emergency_brake_m_s2: NotNegative = 1.0  # a_e
+    brake_max_m_s2: Positive = 1.2  # -a_min
+    traction_max_m_s2: Positive = 0.8  # a_max
+    speed_max_m_s: Positive  # v_max
+    return_gain_1_s2: NotNegative = 0.001  # g
+    return_within_m: NotNegative = 20.0
 
 
 def calibrate(settings: RebasingSettings, *, period_s: float, spacing_m: float) -> np.ndarray:
     """PARAMS, shape (1,), of a train that may re-base; all zero is one that may not. Raises
     CalibrationError if a number does not fit."""
     params = np.zeros(1, PARAMS)
-    gain = abs(settings.return_gain_1_s2)
+    gain = settings.return_gain_1_s2
     params["enabled"] = 1
     params["separation"] = separation.calibrate(
         l1_m=settings.l1_m,
@@ -117,6 +121,11 @@ def calibrate(settings: RebasingSettings, *, period_s: float, spacing_m: float) 
         d=settings.d,
         most_m_s2=settings.separation_max_m_s2,
     )
+    if not settings.l1_m < spacing_m < settings.l2_m:
+        raise CalibrationError(
+            f"l1_m, l2_m are {settings.l1_m:g}, {settings.l2_m:g}, expected line.spacing_m,"
+            f" {spacing_m:g}, between them"
+        )
     for name, value, q, bits in (
         ("error_max", settings.error_max_m, 15, 32),
         ("spacing", spacing_m, 15, 32),

@@ -18,6 +18,7 @@ DELAY_MAX = 16
 
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e3)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e3)]
+Lag = Annotated[float, msgspec.Meta(ge=0, le=60)]  # more is no train's
 Efficiency = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
@@ -26,8 +27,8 @@ class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     force_max_m_s2: Positive  # largest specific force of the whole train
     delay_ticks: int = 0  # from command to actuator
-    lag_traction_s: NotNegative = 0.0
-    lag_brake_s: NotNegative = 0.0
+    lag_traction_s: Lag = 0.0
+    lag_brake_s: Lag = 0.0
     jerk_max_m_s3: NotNegative = 0.0  # slope of the command
     recuperation_efficiency: Efficiency = 0.0  # part of the braking work that comes back
 

@@ -55,6 +55,7 @@ class Sensor(Window, frozen=True, kw_only=True):
     quantity: str
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.quantity not in QUANTITIES:
             raise ValueError(f"quantity is {self.quantity!r}, expected speed or position")
 

@@ -19,6 +19,11 @@ Seconds = Annotated[float, msgspec.Meta(ge=0)]
 Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
+def _check_window(from_s: float, to_s: float) -> None:
+    if to_s <= from_s:
+        raise ValueError(f"to is {to_s:g}, expected more than from, {from_s:g}")
+
+
 class Outage(
     msgspec.Struct,
     frozen=True,
@@ -29,6 +34,9 @@ class Outage(
 
     from_s: Seconds
     to_s: Seconds
+
+    def __post_init__(self) -> None:
+        _check_window(self.from_s, self.to_s)
 
 
 class Radio(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -63,6 +71,7 @@ class Fault(
     emergency: bool = False  # ATP says so: supervision is emergency_brake while it brakes
 
     def __post_init__(self) -> None:
+        _check_window(self.from_s, self.to_s)
         if (self.traction_share is None) == (self.brake_m_s2 is None):
             raise ValueError("expected one of traction_share and brake_m_s2")
         if self.emergency and self.brake_m_s2 is None:

@@ -3,7 +3,8 @@ for what is wrong.
 
 A scenario may stand on another: `base = "subway-paper"` takes that one's values and replaces what
 this file states. Found by name among the packaged scenarios, or as the path of a file (a base's is
-relative to the file that names it).
+relative to the file that names it). `unset = ["control.guard.jerk_max_m_s3"]` takes keys of the
+base away, so that their defaults count.
 
 One file may hold named cases: `[cases.VI]` states what that case replaces, and `gradient:VI` (or
 `my.toml:VI`) is the scenario with it.
@@ -11,10 +12,11 @@ One file may hold named cases: `[cases.VI]` states what that case replaces, and 
 
 from __future__ import annotations
 
+import copy
 import hashlib
-import tomllib
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
@@ -22,7 +24,9 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
+from ato_hil.can_dbc import settings
 from ato_hil.can_dbc.errors import InputError, expected, validation
+from ato_hil.plant_sim import fits
 from ato_hil.plant_sim.actuator import Actuator
 from ato_hil.plant_sim.atp import Atp
 from ato_hil.plant_sim.atp_tables import braking_fault
@@ -35,7 +39,7 @@ from ato_hil.plant_sim.profile import (
     rate_of,
     stretched,
 )
-from ato_hil.plant_sim.track import Track, sections
+from ato_hil.plant_sim.track import Track, known, sections
 from ato_hil.plant_sim.trains import couplers, lumped, point
 
 FOLDER = Path(__file__).with_name("scenarios")
@@ -48,10 +52,13 @@ MODELS: dict[type, ModuleType] = {
 }
 AnyTrain = lumped.Train | couplers.Train | point.Train
 
+RUNS_MAX = 4095  # numbers that RUN_CTRL carries
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
 Ticks = Annotated[int, msgspec.Meta(ge=0, le=10_000)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=2)]
+StartOffset = Annotated[float, msgspec.Meta(ge=-1e3, le=1e3)]
+StartSpread = Annotated[float, msgspec.Meta(ge=0, le=1e3)]
 MassError = Annotated[float, msgspec.Meta(ge=-0.5, le=1)]
 
 
@@ -101,6 +108,30 @@ class RunLength(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
             )
 
 
+class Start(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where a train stands when a run begins, off its mark: the sum of both keys; the reference
+    stays where it is."""
+
+    offsets_m: list[StartOffset] = []  # of run 1, 2, …, and from the first again; of every train
+    spread_m: StartSpread = 0.0  # uniform up to this, either way; new in each run, for each train
+
+    @property
+    def most_m(self) -> float:
+        """The furthest that a train stands off its mark."""
+        return max(map(abs, self.offsets_m), default=0.0) + self.spread_m
+
+
+class Change(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What plant and sensors are from a run on: tables on top of the scenario's, and of a line's
+    members. The controller, its gradient map and the reference stay as they are."""
+
+    from_run: Annotated[int, msgspec.Meta(ge=1, le=RUNS_MAX)]
+    train: dict[str, Any] = {}  # keys of [train] to replace, but for model and the number of cars
+    sensors: dict[str, Any] = {}  # keys of [sensors] to replace
+    actuator: dict[str, Any] = {}  # keys of [actuator] to replace
+    track: dict[str, Any] = {}  # keys of [track] to replace; ATP knows the new track
+
+
 class Metrics(
     msgspec.Struct,
     frozen=True,
@@ -108,10 +139,14 @@ class Metrics(
     kw_only=True,
     rename={"from_s": "from", "to_s": "to"},
 ):
-    """Window of the errors in the summary, seconds; the whole run by default."""
+    """Window of the errors in the summary; the whole run by default."""
 
-    from_s: float = 0.0
-    to_s: float = float("inf")
+    from_s: NotNegative = 0.0
+    to_s: Annotated[float, msgspec.Meta(gt=0)] = float("inf")
+
+    def __post_init__(self) -> None:
+        if self.to_s <= self.from_s:
+            raise ValueError(f"to is {self.to_s:g}, expected more than from, {self.from_s:g}")
 
 
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -133,7 +168,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     title: str
     law: str  # default law
-    runs: int  # default number of runs
+    runs: Annotated[int, msgspec.Meta(le=RUNS_MAX)]  # default number of runs
     period_s: Positive  # control period
     train: AnyTrain
     profile: ProfilePlan
@@ -144,6 +179,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     disturbance: Disturbance = Disturbance()
     atp: Atp = Atp()
     run_length: RunLength | None = None  # none: every run lasts as long as the profile
+    start: Start = Start()
+    changes: list[Change] = []  # plant and sensors from a run on, in the order of their runs
     control: Control = Control()
     metrics: Metrics = Metrics()
     line: Line | None = None  # several trains; none: one
@@ -215,7 +252,7 @@ def find(name: str) -> tuple[Path, str]:
         file, case = name, ""
     elif not case:
         raise ScenarioError(f"{name}: expected the name of a case after the colon")
-    if file.endswith(".toml"):
+    if file.lower().endswith(".toml"):
         path = Path(file)
         if not path.is_file():
             raise ScenarioError(f"{file}: no such scenario file")
@@ -230,11 +267,9 @@ def find(name: str) -> tuple[Path, str]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: not valid TOML: {error}") from None
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+        return settings.read_toml(path)
+    except ValueError as error:
+        raise ScenarioError(f"{path}: {error}") from None
 
 
 def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
@@ -258,12 +293,52 @@ def _content(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
             below, case = find(str(path.parent / base) if _is_file_name(base) else base)
         except ScenarioError as error:
             raise ScenarioError(f"{path}: key `base`: {error}") from None
-        content = _merged(_in_case(below, case, _content(below, (*seen, path))), content)
+        inherited = _in_case(below, case, _content(below, (*seen, path)))
+        content = _merged(_without(path, inherited, content), content)
+    elif "unset" in content:
+        raise ScenarioError(f"{path}: key unset: there is no base of which to unset keys")
+    content.pop("unset", None)
     return content
 
 
+def _without(path: Path, inherited: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
+    """What a base gives, without the keys that `unset` of `content` names."""
+    keys = content.get("unset", [])
+    if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
+        raise ScenarioError(f"{path}: key unset: expected a list of keys, as train.start_m")
+    result = copy.deepcopy(inherited)
+    for key in keys:
+        *tables, last = key.split(".")
+        table: Any = result
+        for step in tables:
+            table = table.get(step) if isinstance(table, dict) else None
+        if not isinstance(table, dict) or last not in table:
+            raise ScenarioError(f"{path}: key unset: the base has no {key}")
+        del table[last]
+    return result
+
+
+def layers(name: str) -> list[tuple[str, dict[str, Any]]]:
+    """What a scenario is made of, the lowest base first: the name of each file, with its case, and
+    what it states. Raises ScenarioError."""
+    path, case = find(name)
+    _content(path)  # so that a loop is refused
+    found: list[tuple[str, dict[str, Any]]] = []
+    while True:
+        content = _read(path)
+        own = [(path.name, content)]
+        below = content.get("base", "")
+        if case:
+            inherited = _content(path)["cases"][case]
+            own.append((f"{path.name}:{case}", inherited))
+        found = own + found
+        if not below:
+            return found
+        path, case = find(str(path.parent / below) if _is_file_name(below) else below)
+
+
 def _is_file_name(name: str) -> bool:
-    return name.endswith(".toml") or ".toml:" in name
+    return name.lower().endswith(".toml") or ".toml:" in name.lower()
 
 
 def _in_case(path: Path, case: str, content: dict[str, Any]) -> dict[str, Any]:
@@ -304,7 +379,10 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
     try:
         scenario = msgspec.convert(content, Scenario)
     except msgspec.ValidationError as error:
-        raise ScenarioError(f"{_place(path, case)}: {_where(error)}") from None
+        raise ScenarioError(f"{_place(path, case)}: {_wrong(error)}") from None
+    strange = settings.strange_number(content)
+    if strange:
+        raise ScenarioError(f"{_place(path, case)}: key {strange.key}: {strange.text}")
     _check(_place(path, case), scenario)
     try:
         segments = plan_profile(scenario.profile, scenario.period_s)
@@ -322,8 +400,20 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
         segments,
         profile,
     )
-    if scenario.line:
-        members(loaded)  # so that a wrong one is refused here
+    place = _place(path, case)
+    for change in (0, *(change.from_run for change in scenario.changes)):
+        for each in members(loaded):  # so that a wrong one is refused here
+            own = in_run(each, change)
+            try:
+                fits.check(own.scenario, own.profile)
+            except ValueError as error:
+                since = f" (from run {change})" if change else ""
+                raise ScenarioError(f"{place}: key {error}{since}") from None
+    if scenario.metrics.from_s >= scenario.profile.duration_s:
+        raise ScenarioError(
+            f"{place}: key metrics.from: {scenario.metrics.from_s:g}, expected less than"
+            f" profile.duration_s, {scenario.profile.duration_s:g}"
+        )
     if scenario.run_length and scenario.run_length.reading == "stretched":
         try:
             _check_stretch(loaded, scenario.run_length)
@@ -392,48 +482,83 @@ def _own_numbers(loaded: Loaded, line: Line, train: int) -> Scenario:
     try:
         return msgspec.convert(content, Scenario)
     except msgspec.ValidationError as error:
-        raise ScenarioError(f"{where}: {_where(error)}") from None
+        raise ScenarioError(f"{where}: {_wrong(error)}") from None
 
 
-def _where(error: msgspec.ValidationError) -> str:
+def in_run(loaded: Loaded, run: int) -> Loaded:
+    """A train's scenario with what has changed by run `run`. Raises ScenarioError if a change is
+    wrong."""
+    scenario, place = loaded.scenario, _place(loaded.path, loaded.case)
+    for number, change in enumerate(loaded.scenario.changes):
+        if change.from_run > run:
+            break
+        where = f"{place}: key changes[{number}]"
+        tables = msgspec.to_builtins(change)
+        del tables["from_run"]
+        if "start_m" in change.train:
+            raise ScenarioError(f"{where}.train.start_m: expected start.offsets_m instead")
+        content = _merged(msgspec.to_builtins(scenario), tables)
+        try:
+            changed = msgspec.convert(content, Scenario)
+        except msgspec.ValidationError as error:
+            raise ScenarioError(f"{where}: {_wrong(error)}") from None
+        if type(changed.train) is not type(scenario.train):
+            raise ScenarioError(f"{where}.train.model: expected the train model of the scenario")
+        cars = len(scenario.train.effectiveness)
+        if len(changed.train.effectiveness) != cars:
+            raise ScenarioError(f"{where}.train: expected {cars} cars, as the controller knows")
+        _check(place, changed, f"changes[{number}].")
+        scenario = changed
+    return (
+        loaded
+        if scenario is loaded.scenario
+        else msgspec.structs.replace(loaded, scenario=scenario)
+    )
+
+
+def _wrong(error: msgspec.ValidationError) -> str:
     """The validator's message with the key first: `train.masses_kg: Expected ...`."""
     text, place = validation(error, Scenario)
     return f"key {place.lstrip('.')}: {text}" if place else text
 
 
-def _check(path: str, scenario: Scenario) -> None:
-    """What types cannot say."""
+def _check(path: str, scenario: Scenario, under: str = "") -> None:
+    """What types cannot say; `under` is put before the keys of what the scenario became of."""
     if scenario.law not in scenario.laws:
         raise ScenarioError(
-            f"{path}: key law: {scenario.law!r} has no gains,"
+            f"{path}: key {under}law: {scenario.law!r} has no gains,"
             f" expected a table [laws.{scenario.law}]"
         )
     if scenario.runs < 1:
-        raise ScenarioError(f"{path}: key runs: {scenario.runs}, expected 1 or more")
+        raise ScenarioError(f"{path}: key {under}runs: {scenario.runs}, expected 1 or more")
     if isinstance(scenario.train, couplers.Train):
         model = "train model 'couplers' takes each car by itself"
         if not scenario.control.distribute:
-            raise ScenarioError(f"{path}: key control.distribute: {model}, expected true")
+            raise ScenarioError(f"{path}: key {under}control.distribute: {model}, expected true")
         if scenario.track.application != "smeared":
-            raise ScenarioError(f"{path}: key track.application: {model}, expected 'smeared'")
+            raise ScenarioError(
+                f"{path}: key {under}track.application: {model}, expected 'smeared'"
+            )
     if isinstance(scenario.train, point.Train):
         model = "train model 'point' has no cars"
         if scenario.control.distribute:
-            raise ScenarioError(f"{path}: key control.distribute: {model}, expected false")
+            raise ScenarioError(f"{path}: key {under}control.distribute: {model}, expected false")
         if scenario.track.application == "smeared":
-            raise ScenarioError(f"{path}: key track.application: {model}, expected 'point'")
+            raise ScenarioError(f"{path}: key {under}track.application: {model}, expected 'point'")
     elif scenario.track.sloped:
         key = "interpolation" if scenario.track.interpolation != "hold" else "averaged_over_m"
         model = "only train model 'point' takes such a track"
-        raise ScenarioError(f"{path}: key track.{key}: {model}")
+        raise ScenarioError(f"{path}: key {under}track.{key}: {model}")
     if scenario.line and not isinstance(scenario.train, point.Train):
-        raise ScenarioError(f"{path}: key train.model: a line has trains of model 'point'")
+        raise ScenarioError(f"{path}: key {under}train.model: a line has trains of model 'point'")
+    if any(b.from_run <= a.from_run for a, b in pairwise(scenario.changes)):
+        raise ScenarioError(f"{path}: key changes: expected from_run to rise")
     has_limits = scenario.profile.limits or scenario.profile.limit_above_m_s is not None
     if not has_limits and not scenario.atp.speeds:
-        raise ScenarioError(f"{path}: key profile.limits: expected at least one limit")
-    fault = braking_fault(scenario.atp, sections(scenario.track))
+        raise ScenarioError(f"{path}: key {under}profile.limits: expected at least one limit")
+    fault = braking_fault(scenario.atp, sections(known(scenario.track)))
     if fault:
-        raise ScenarioError(f"{path}: key {fault}")
+        raise ScenarioError(f"{path}: key {under}{fault}")
 
 
 def shortened(loaded: Loaded, ticks: int) -> Loaded:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 import msgspec
@@ -12,6 +13,10 @@ from ato_hil.can_dbc.step import int64, step
 Place = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 Resistance = Annotated[float, msgspec.Meta(ge=-1e3, le=1e3)]
 Length = Annotated[float, msgspec.Meta(ge=0, le=1e4)]
+Wavelength = Annotated[float, msgspec.Meta(gt=0, le=1e5)]
+
+PARTS = 16  # of a wave, each straight or level
+PARTS_MAX = 20_000  # of all the waves of a track
 
 SECTION = np.dtype(
     [
@@ -20,6 +25,25 @@ SECTION = np.dtype(
         ("slope_n_per_kn_m", np.float64),  # change a metre
     ]
 )
+
+
+class Swing(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Resistance that swings over position like a sine, in sixteenths of a wave: straight ones for
+    train model "point", level ones for the others."""
+
+    from_m: Place = 0.0  # where it begins, at 0
+    to_m: Place  # where it ends
+    wavelength_m: Wavelength
+    amplitude_n_per_kn: Resistance
+
+    def __post_init__(self) -> None:
+        if self.to_m <= self.from_m:
+            raise ValueError(f"to_m is {self.to_m:g}, expected more than from_m, {self.from_m:g}")
+
+    @property
+    def parts(self) -> int:
+        """Parts of waves, the last one begun."""
+        return math.ceil((self.to_m - self.from_m) / self.wavelength_m * PARTS)
 
 
 class Track(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -33,6 +57,7 @@ class Track(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     averaged_over_m: Length = 0.0  # mean of the steps over so many metres behind the front
     from_m: list[Place] = []
     resistance_n_per_kn: list[Resistance] = []
+    swings: list[Swing] = []  # on top, and in no map: neither the controller's nor ATP's
 
     def __post_init__(self) -> None:
         if self.application not in ("point", "smeared"):
@@ -45,6 +70,11 @@ class Track(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             raise ValueError("from_m and resistance_n_per_kn must have the same length")
         if any(b <= a for a, b in zip(self.from_m, self.from_m[1:], strict=False)):
             raise ValueError("from_m must rise")
+        parts = sum(swing.parts for swing in self.swings)
+        if parts > PARTS_MAX:
+            raise ValueError(
+                f"swings have {parts} sixteenths of waves, expected at most {PARTS_MAX}"
+            )
 
     @property
     def sloped(self) -> bool:
@@ -56,6 +86,8 @@ def sections(track: Track) -> np.ndarray:
     """The track as SECTION records, with a level one from -inf in front."""
     from_m = np.asarray(track.from_m, np.float64)
     resistance = np.asarray(track.resistance_n_per_kn, np.float64)
+    for swing in track.swings:
+        from_m, resistance = _swung(from_m, resistance, swing, track.interpolation == "linear")
     if track.averaged_over_m > 0:
         from_m, resistance = _averaged(from_m, resistance, track.averaged_over_m)
     table = np.zeros(len(from_m) + 1, SECTION)
@@ -65,6 +97,37 @@ def sections(track: Track) -> np.ndarray:
     if track.sloped:
         table["slope_n_per_kn_m"][1:-1] = np.diff(resistance) / np.diff(from_m)
     return table
+
+
+def known(track: Track) -> Track:
+    """What maps have of the track: all but what swings."""
+    return msgspec.structs.replace(track, swings=[]) if track.swings else track
+
+
+def _swung(
+    from_m: np.ndarray, resistance: np.ndarray, swing: Swing, linear: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places and resistance with a swing on top: knots of straight lines, or of level parts, which
+    have the sine of their middle."""
+    part_m = swing.wavelength_m / PARTS
+    places = np.round(swing.from_m + part_m * np.arange(swing.parts + 1), 6)
+    places[-1] = swing.to_m
+    if linear:  # the step from 0 to the first value stays one
+        places = np.append(places, from_m[:1] - 0.01)
+    knots = np.union1d(from_m, places)
+    if linear:
+        below = np.interp(knots, from_m, resistance, left=0.0) if len(from_m) else 0.0 * knots
+        phases = knots - swing.from_m
+        inside = (knots > swing.from_m) & (knots < swing.to_m)
+    else:
+        index = np.searchsorted(from_m, knots, side="right") - 1
+        below = np.where(index >= 0, np.append(resistance, 0.0)[index], 0.0)
+        part = np.floor((knots - swing.from_m) / part_m + 1e-5)
+        phases = (part + 0.5) * part_m
+        inside = (knots >= swing.from_m) & (knots < swing.to_m)
+    # Rounded: the last bits of a sine are the machine's.
+    sine = [round(math.sin(math.tau * at / swing.wavelength_m), 9) for at in phases.tolist()]
+    return knots, below + np.where(inside, swing.amplitude_n_per_kn * np.array(sine), 0.0)
 
 
 def _averaged(

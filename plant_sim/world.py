@@ -23,14 +23,16 @@ from ato_hil.plant_sim import (
     plant,
     track,
 )
-from ato_hil.plant_sim.line import Fault
+from ato_hil.plant_sim.line import TRAINS_MAX, Fault
 from ato_hil.plant_sim.profile import RATE_ONE, rate_of, stretched_ticks
 from ato_hil.plant_sim.scenario import (
     MODELS,
     Loaded,
     RunLength,
     Scenario,
+    Start,
     at_rate,
+    in_run,
     members,
 )
 from ato_hil.plant_sim.trains import couplers, point
@@ -39,6 +41,7 @@ from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 # Chance: what a random number is drawn for; each gets a stream of its own, in each train.
 SPEED_NOISE, DISTURBANCE, LOST_AHEAD, LOST_BEHIND = 0, 1, 2, 3
 STREAMS = 4  # of a train
+START = STREAMS * TRAINS_MAX  # and the number of the train: where it stands
 RUN_LENGTH = LOST_AHEAD  # of a run: the leader has no train ahead whose packets are lost
 NEVER = 2**62  # tick
 TICKS_AT_ONCE = 4096  # for which noise is drawn: what it takes stays in the processor's cache
@@ -48,8 +51,10 @@ TICKS_AT_ONCE = 4096  # for which noise is drawn: what it takes stays in the pro
 class World:
     """Buffers of one plant with all its trains."""
 
-    members: list[Loaded]  # the scenario of each train
+    planned: list[Loaded]  # the scenario of each train
+    members: list[Loaded]  # the same, with what has changed by this run
     seed: int
+    model: Any  # of the trains
     begin: Any  # steps of plant.build
     sense: Any
     actuate_and_advance: Any
@@ -66,10 +71,20 @@ class World:
         return run_ticks(self.members[0], self.seed, run)
 
     def prepare(self, run: int) -> None:
-        """What a run has of its own before it is announced: its timetable, and the limit along
-        that."""
+        """What a run has of its own before it is announced: its plant and sensors, where its trains
+        stand, its timetable, and the limit along that."""
+        before = self.members[0].scenario
+        self.members = [in_run(train, run) for train in self.planned]
+        changed = self.members[0].scenario != before
+        if changed or before.start != Start():
+            for train in self.members:
+                offset_m = start_offset_m(train, self.seed, run)
+                own = _params(train, self.model, offset_m)[0]
+                own["failures"] = self.params[train.train]["failures"]
+                self.params[train.train] = own
+            self.track = rows(track.sections(self.members[0].scenario.track))
         rate = timetable_rate(self.members[0], self.seed, run)
-        if rate != int(self.state[0]["node"]["timetable_rate"]):
+        if changed or rate != int(self.state[0]["node"]["timetable_rate"]):
             self.limits = supervised(at_rate(self.members[0], rate))
         self.state["node"]["timetable_rate"] = rate
 
@@ -92,8 +107,10 @@ def build(loaded: Loaded, seed: int, fails: Sequence[failures.AnyFailure] = ()) 
         params["failures"][train.train] = own[0]
     boxes = (len(trains), MESSAGE_COUNT)
     return World(
+        planned=trains,
         members=trains,
         seed=seed,
+        model=model,
         begin=begin,
         sense=sense,
         actuate_and_advance=actuate_and_advance,
@@ -107,13 +124,14 @@ def build(loaded: Loaded, seed: int, fails: Sequence[failures.AnyFailure] = ()) 
     )
 
 
-def _params(loaded: Loaded, model: Any) -> np.ndarray:
-    """PARAMS of one train, shape (1,)."""
+def _params(loaded: Loaded, model: Any, offset_m: float = 0.0) -> np.ndarray:
+    """PARAMS, shape (1,), of one train that stands `offset_m` off its mark when a run begins."""
     scenario = loaded.scenario
     train = scenario.train
     smeared = scenario.track.application == "smeared"
     params = np.zeros(1, plant.params_dtype(model.PARAMS))
     params["train"] = model.calibrate(train, scenario.period_s, smeared)
+    params["train"]["start_m"] += offset_m
     params["actuator"] = actuator.calibrate(
         scenario.actuator, train.mass_kg, scenario.period_s, scenario.period_s / train.substeps
     )
@@ -139,8 +157,9 @@ def _params(loaded: Loaded, model: Any) -> np.ndarray:
     )
     if isinstance(train, point.Train) and train.held_at_start:
         sections = rows(track.sections(scenario.track))
-        here = track.section_at(sections, train.start_m, 0)
-        grade = GRAVITY_M_S2 * N_PER_KN * track.resistance_at(sections, here, train.start_m)
+        start_m = train.start_m + offset_m
+        here = track.section_at(sections, start_m, 0)
+        grade = GRAVITY_M_S2 * N_PER_KN * track.resistance_at(sections, here, start_m)
         node["holding_force_n"] = train.mass_kg * (train.resistance.constant[0] + grade)
     if scenario.line:
         radio = params["radio"]
@@ -169,13 +188,17 @@ def _fail(node: np.ndarray, fault: Fault, scenario: Scenario) -> None:
 def supervised(loaded: Loaded) -> atp.Limits:
     """What ATP supervises, for the steps."""
     scenario = loaded.scenario
-    sections = track.sections(scenario.track)
-    steepest = min(atp_tables.gradients(sections, 0.0).values)
+    steepest = min(atp_tables.gradients(track.sections(scenario.track), 0.0).values)
     rolling_m_s2 = max(-steepest, 0.0) + scenario.disturbance.amplitude_m_s2
     pulling_m_s2 = scenario.actuator.force_max_m_s2 + rolling_m_s2
     limits = limits_of(loaded)
     made = atp_tables.supervised(
-        scenario.atp, limits, sections, scenario.period_s, pulling_m_s2, rolling_m_s2
+        scenario.atp,
+        limits,
+        track.sections(track.known(scenario.track)),
+        scenario.period_s,
+        pulling_m_s2,
+        rolling_m_s2,
     )
     return atp.Limits(*map(rows, made))
 
@@ -239,6 +262,16 @@ def _length_ticks(loaded: Loaded, lengths: RunLength, seed: int, run: int) -> in
     if run == 1 and lengths.first_s is not None:
         length_s = lengths.first_s
     return int(length_s / loaded.scenario.period_s + 0.5)
+
+
+def start_offset_m(loaded: Loaded, seed: int, run: int) -> float:
+    """How far off its mark a train stands when a run begins; an initial run 0 begins as run 1."""
+    start = loaded.scenario.start
+    offset_m = start.offsets_m[(max(run, 1) - 1) % len(start.offsets_m)] if start.offsets_m else 0.0
+    if start.spread_m > 0:
+        drawn = float(_uniform(_bits(seed, run, START + loaded.train, 1))[0])
+        offset_m += start.spread_m * (2.0 * drawn - 1.0)
+    return offset_m
 
 
 def _bits(seed: int, run: int, stream: int, count: int) -> np.ndarray:

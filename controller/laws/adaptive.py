@@ -38,7 +38,7 @@ from ato_hil.controller.q import (
     round_shift,
     sat32,
 )
-from ato_hil.controller.quantise import Vehicle, fixed
+from ato_hil.controller.quantise import Gain, Vehicle, fixed
 
 PARAMS = np.dtype(
     [
@@ -75,8 +75,8 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains in the paper's units."""
 
-    alpha: float  # 1/s
-    g0: float  # N s/m
+    alpha: Gain  # 1/s
+    g0: Gain  # N s/m
     g1: NotNegative  # 1/s
     g2: NotNegative  # N/m
     eps1: Annotated[float, msgspec.Meta(gt=0)]  # m/s

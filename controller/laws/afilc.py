@@ -50,7 +50,12 @@ from ato_hil.controller.q import (
     round_shift,
     sat32,
 )
-from ato_hil.controller.quantise import Vehicle, fixed
+from ato_hil.controller.quantise import (
+    Gain,
+    Vehicle,
+    check_bounds,
+    fixed,
+)
 
 RULES = 4
 W_MIN = 2.0**-8  # of 1 - (phi/kv)^2: the sampled phi can step over kv
@@ -106,8 +111,8 @@ Bounds = tuple[float, float]
 class CommonGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains of this law and of `afilc_track`, SI; forces are those of a kilogram."""
 
-    beta: float  # 1/s
-    psi1: float  # 1/s
+    beta: Gain  # 1/s
+    psi1: Gain  # 1/s
     kv: Positive  # m/s
     Gamma: tuple[NotNegative, NotNegative, NotNegative]  # of a, b, c
     Gamma_w: NotNegative  # of each w_l
@@ -119,6 +124,10 @@ class CommonGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     rho_max: NotNegative  # m/s^2
     feedforward: bool = False  # h is added
     eps: NotNegative = 0.0  # m/s, half the boundary layer; 0: sgn
+
+    def __post_init__(self) -> None:
+        for name in ("a", "b", "c", "w"):
+            check_bounds(name, *getattr(self, name))
 
 
 class Gains(CommonGains, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -24,7 +24,7 @@ from ato_hil.controller.q import (
     clamp,
     sat32,
 )
-from ato_hil.controller.quantise import Vehicle, fixed
+from ato_hil.controller.quantise import Gain, Vehicle, fixed
 
 PARAMS = cailc.PARAMS
 STATE = cailc.STATE
@@ -35,9 +35,9 @@ ESTIMATES = (*WORDS, ("delta", "m/s", 24))
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper, SI: forces in N, M in kg."""
 
-    alpha: float  # 1/s
-    beta: float  # N s/m
-    Gamma: tuple[float, float, float]  # diagonal
+    alpha: Gain  # 1/s
+    beta: Gain  # N s/m
+    Gamma: tuple[Gain, Gain, Gain]  # diagonal
     Xi_initial: tuple[float, float, float]  # N, N s/m, N s^2/m^2
 
 

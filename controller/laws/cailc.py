@@ -46,7 +46,12 @@ from ato_hil.controller.q import (
     sat32,
     sin_half_pi,
 )
-from ato_hil.controller.quantise import Vehicle, fixed
+from ato_hil.controller.quantise import (
+    Gain,
+    Vehicle,
+    check_bounds,
+    fixed,
+)
 
 THETA_Q = (34, 39, 43)
 GAMMA_Q = (30, 43, 49)
@@ -78,14 +83,18 @@ ESTIMATES = (*WORDS, ("delta", "m/s", 24), ("chi", "m/s", 24))
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper, SI: forces in N, M in kg."""
 
-    alpha: float  # 1/s
-    beta: float  # N s/m
-    Gamma: tuple[float, float, float]  # diagonal
+    alpha: Gain  # 1/s
+    beta: Gain  # N s/m
+    Gamma: tuple[Gain, Gain, Gain]  # diagonal
     nu_b: Annotated[float, msgspec.Meta(gt=0)]  # m/s
     r_max: Annotated[float, msgspec.Meta(ge=0, le=1)]
     Xi_min: tuple[float, float, float]  # N, N s/m, N s^2/m^2
     Xi_max: tuple[float, float, float]
     Xi_initial: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        for q, bounds in enumerate(zip(self.Xi_min, self.Xi_max, strict=True)):
+            check_bounds(f"Xi_min[{q}] to Xi_max[{q}]", *bounds)
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

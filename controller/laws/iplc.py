@@ -61,6 +61,7 @@ from ato_hil.controller.q import (
 )
 from ato_hil.controller.quantise import (
     CalibrationError,
+    Gain,
     Recall,
     Vehicle,
     fixed,
@@ -155,7 +156,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 class CommonGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains that do not depend on the horizon. Inputs are for each kilogram, N/kg."""
 
-    Q: tuple[tuple[float, float], tuple[float, float]]  # of speed and position error
+    Q: tuple[tuple[Gain, Gain], tuple[float, float]]  # of speed and position error
     R: NotNegative  # of the change of the input
     S: NotNegative  # of the input: energy
     estimate: bool = False  # of phi; else phi = [1, 0]
@@ -164,9 +165,9 @@ class CommonGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     delta: Annotated[float, msgspec.Meta(gt=0, lt=2)] = 0.5
     m: Annotated[int, msgspec.Meta(ge=0, le=127)] = 0  # ticks of look-ahead
     h: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0  # ticks either side in the moving average
-    kfv: float = 0.0  # 1/s, feedback of the current run
-    kfs: float = 0.0  # 1/s^2
-    initial: tuple[float, float] = (0.0, 0.0)  # kfv, kfs of run 0
+    kfv: Gain = 0.0  # 1/s, feedback of the current run
+    kfs: Gain = 0.0  # 1/s^2
+    initial: tuple[Gain, Gain] = (0.0, 0.0)  # kfv, kfs of run 0
     slope_max: NotNegative = 0.0  # N/kg/s, 0: free
 
 

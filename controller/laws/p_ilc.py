@@ -26,7 +26,7 @@ from ato_hil.can_dbc.step import (
     step,
 )
 from ato_hil.controller.q import clamp, round_shift, sat32
-from ato_hil.controller.quantise import Vehicle, fixed
+from ato_hil.controller.quantise import Gain, Vehicle, fixed
 
 PARAMS = np.dtype(
     [
@@ -61,8 +61,8 @@ ESTIMATES = (*WORDS, ("increment", "m/s^2", 27))
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper, and the input of the first run; forces are those of a kilogram."""
 
-    K1: float  # 1/s^2
-    K2: float  # 1/s
+    K1: Gain  # 1/s^2
+    K2: Gain  # 1/s
     feedforward: bool = False
     resistance: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s^2, 1/s, 1/m
 

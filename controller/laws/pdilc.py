@@ -21,7 +21,7 @@ from ato_hil.can_dbc.step import Record, int64, step
 from ato_hil.controller.laws import pid as pid_law
 from ato_hil.controller.laws.pid import pid
 from ato_hil.controller.q import clamp, round_shift, sat32
-from ato_hil.controller.quantise import Vehicle, fixed
+from ato_hil.controller.quantise import Gain, Vehicle, fixed
 
 INITIAL_RUN = True  # runs are numbered from 0
 
@@ -46,11 +46,11 @@ ESTIMATES = (*WORDS, ("eps", "m/s", 24))
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper; gp, gI, gD are those of the PID in run 0."""
 
-    kp: float  # N s/m
-    kD: float  # N s^2/m
-    gp: float  # N s/m
-    gI: float  # N/m
-    gD: float  # N s^2/m
+    kp: Gain  # N s/m
+    kD: Gain  # N s^2/m
+    gp: Gain  # N s/m
+    gI: Gain  # N/m
+    gD: Gain  # N s^2/m
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ato_hil.can_dbc.step import Record, int64, step
 from ato_hil.controller.q import clamp, round_shift, sat32
-from ato_hil.controller.quantise import Vehicle, fixed
+from ato_hil.controller.quantise import Gain, Vehicle, fixed
 
 PARAMS = np.dtype(
     [
@@ -49,9 +49,9 @@ STATE_BOUNDS = {"integral": (-INTEGRAL_MAX, INTEGRAL_MAX)}
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper."""
 
-    gp: float  # N s/m
-    gI: float  # N/m
-    gD: float  # N s^2/m
+    gp: Gain  # N s/m
+    gI: Gain  # N/m
+    gD: Gain  # N s^2/m
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

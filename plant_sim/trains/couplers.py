@@ -64,6 +64,7 @@ PARAMS = np.dtype(
         ("step_s", np.float64),  # of the integration
         ("period_s", np.float64),
         ("pitch_m", np.float64),
+        ("start_m", np.float64),  # of the front, when a run begins
         ("stiffness_n_m", np.float64),
         ("damping_n_s_m", np.float64),
         ("inverse_mass", np.float64, (CARS_MAX,)),  # 1/kg
@@ -122,7 +123,7 @@ def calibrate(train: Train, period_s: float, smeared: bool) -> np.ndarray:
 def reset(params: Any, state: Any) -> None:
     """The train at rest, the couplers slack."""
     for k in range(params.cars):
-        state.car_position_m[k] = -params.pitch_m * k
+        state.car_position_m[k] = params.start_m - params.pitch_m * k
         state.car_speed_m_s[k] = 0.0
         state.section[k] = 0
     state.acceleration_m_s2 = 0.0

@@ -115,6 +115,7 @@ PARAMS = np.dtype(
         ("period_s", np.float64),
         ("mass_kg", np.float64),
         ("pitch_m", np.float64),
+        ("start_m", np.float64),  # of the front, when a run begins
         ("smeared", np.int64),
         ("weight", np.float64, (CARS_MAX,)),  # m_k g / 1000 / M, kN/kg
         ("kind", KIND, (2,)),  # trailer, motor
@@ -228,10 +229,10 @@ def turn_phases(phases: Any, rotations: Any, count: Any) -> None:
 @step
 def reset(params: Any, state: Any) -> None:
     """The train at rest at the start."""
-    state.position_m = 0.0
+    state.position_m = params.start_m
     state.speed_m_s = 0.0
     state.acceleration_m_s2 = 0.0
-    state.rear_position_m = -params.pitch_m * (params.cars - 1)
+    state.rear_position_m = params.start_m - params.pitch_m * (params.cars - 1)
     state.rear_speed_m_s = 0.0
     state.force_n = 0.0
     state.traction_j = 0.0

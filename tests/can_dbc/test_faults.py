@@ -387,6 +387,11 @@ def test_another_process_reads_plan_and_log(tmp_path: Path) -> None:
         ("[[bus]]\nkind = 'drop'\nfrom = -1", "key bus[0].from: Expected `float` >= 0"),
         ("[[buss]]\nkind = 'drop'", "key buss: did you mean [[bus]]?"),
         ("bus = 1", "key bus: Expected `array`, got `int`"),
+        ("[[bus]]\nkind = 'drop'\nfrom = 20.0\nto = 14.5", "key bus[0]: to is 14.5, expected more"),
+        ("[[bus]]\nkind = 'drop'\nfrom_tick = 5\nto_tick = 5", "key bus[0]: to_tick is 5, expec"),
+        ("[[bus]]\nkind = 'drop'\nto = inf", "key bus[0].to: inf, expected a finite number"),
+        ("[[bus]]\nkind = 'drop'\nruns = [-1]", "key bus[0].runs[0]: Expected `int` >= 0"),
+        ("[[bus]]\nkind = 'drop'\nevry = 2", "key bus[0]: Object contains unknown field `evry`, "),
         ("[[bus]", "not valid TOML: "),
     ],
 )

@@ -142,6 +142,14 @@ def test_the_log_has_when_each_begins(train) -> None:
             "key sensor[0]: quantity is 'x', expected",
         ),
         ("[[sensor]]\nkind = 'slip'\nshare = -2\n", "key sensor[0].share: Expected `float` >= -1"),
+        (
+            "[[sensor]]\nkind = 'slip'\nshare = 0.1\nfrom = 3\nto = 2\n",
+            "key sensor[0]: to is 2, expected more than from, 3",
+        ),
+        (
+            "[[sensor]]\nkind = 'stuck'\nquantity = 'speed'\nfrom = 3\nto = 2\n",
+            "key sensor[0]: to is 2, expected more than from, 3",
+        ),
         ("[[actuator]]\nkind = 'brake'\nshare = 2\n", "key actuator[0].share: Expected `float` <="),
         (
             "[[actuator]]\nkind = 'brake'\n",

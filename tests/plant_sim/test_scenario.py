@@ -113,6 +113,73 @@ MISTAKES = [
         r"\[run_length\]: 120000 ticks are not 2/3 to 2 times the planned 250000",
     ),
     ('base = "subway"\nrun = 3', r"Object contains unknown field `run`, did you mean runs\?"),
+    (
+        'base = "subway"\n[metrics]\nfrom = 500.0',
+        r"key metrics\.from: 500, expected less than profile\.duration_s, 190",
+    ),
+    (
+        'base = "crh3"\n[train]\nmass_kg = 2e6\ncharacteristic = { force_n = 1e6 }',
+        r"key actuator\.force_max_m_s2: times the mass of the train it is 1e\+06 N, expected at"
+        r" most 524288 N, which FORCE_CMD\.Force carries",
+    ),
+    (
+        'base = "subway"\n[train]\nbrake_max_n = [6e5, 1.0, 1.0, 1.0, 1.0, 1.0]',
+        r"key train\.brake_max_n\[0\]: it is 600000 N, .* 524288 N, which CAR_FORCE carries",
+    ),
+    (
+        'base = "crh3"\n[train]\nstart_m = 1000.0',
+        r"key train\.start_m: the distance to the start of the profile is 1000 m, expected at most"
+        r" 256 m, which ATO_TRACKING\.PositionError carries",
+    ),
+    ('base = "crh3"\n[actuator]\nlag_brake_s = 400', r"key actuator\.lag_brake_s: .* <= 60.*"),
+    (
+        'base = "crh3"\n[profile]\nlimits = [{ until_s = 1021.6, speed_m_s = 170.0 }]',
+        r"key profile\.limits\[0\]\.speed_m_s: it is 170 m/s, expected at most 163\.83 m/s, .*",
+    ),
+    (
+        'base = "line"\n[line.radio]\nperiod_ticks = 1000\ndelay_ticks = 4000',
+        r"key line\.radio\.delay_ticks: the age of a packet is 50 s, expected at most 40\.95 s, .*",
+    ),
+    (
+        'base = "subway"\n[disturbance]\namplitude_m_s2 = 15.0',
+        r"key actuator\.force_max_m_s2: with track and disturbance it is 16\.\d+ m/s\^2, .*",
+    ),
+    (
+        'base = "line"\n[line]\nfaults = [{ train = 1, from = 9.0, brake_m_s2 = 2.0 }]',
+        r"key line\.faults\[0\]\.brake_m_s2: 2, expected at most 1\.5, what the actuators give",
+    ),
+    (
+        'base = "subway"\n[train]\npich_m = 3.0',
+        r"key train: Object contains unknown field `pich_m`, did you mean pitch_m\?",
+    ),
+    ('base = "subway"\nruns = 4096', r"key runs: Expected `int` <= 4095"),
+    ('base = "subway"\n[metrics]\nfrom = -1.0', r"key metrics.from: Expected `float` >= 0.0"),
+    (
+        'base = "subway"\n[metrics]\nfrom = 20.0\nto = 10.0',
+        r"key metrics: to is 10, expected more than from, 20",
+    ),
+    ('base = "subway"\n[metrics]\nto = nan', r"key metrics.to: Expected `float` > 0.0"),
+    ('base = "subway"\n[metrics]\nto = inf', r"key metrics\.to: inf, expected a finite number"),
+    (
+        'base = "line"\n[line.radio]\noutages = [{ from = 9.0, to = 9.0 }]',
+        r"key line\.radio\.outages\[0\]: to is 9, expected more than from, 9",
+    ),
+    (
+        'base = "line"\n[line]\nfaults = [{ train = 1, from = 9, to = 8, brake_m_s2 = 1.0 }]',
+        r"key line\.faults\[0\]: to is 8, expected more than from, 9",
+    ),
+    (
+        'base = "subway"\n[laws.cailc]\nGamma = [1.0, nan, 1.0]',
+        r"key laws\.cailc\.Gamma\[1\]: nan, expected a finite number",
+    ),
+    (
+        'base = "subway"\n[train]\nmotor_cars = [9223372036854775808]',
+        r"key train: motor_cars: expected numbers from 1 to 6",
+    ),
+    (
+        'base = "subway"\n[laws.cailc]\nalpha = 9223372036854775808',
+        r"key laws\.cailc\.alpha: expected a whole number of at most 64 bits",
+    ),
     ('base = "subway"\nruns = 0', r"key runs: 0, expected 1 or more"),
     (
         'base = "subway"\nlaw = "bang-bang"',
@@ -159,6 +226,44 @@ def test_a_mistake_gives_one_line_with_file_and_key(write, text, says):
     with pytest.raises(ScenarioError) as error:
         load(path)
     assert re.fullmatch(f"{re.escape(path)}: {says}", str(error.value))
+
+
+def test_a_key_of_the_base_is_unset(write):
+    write('base = "crh3-learning"\nunset = ["run_length", "sensors.speed_noise_m_s"]', "less.toml")
+    less, whole = load(write('base = "less.toml"')).scenario, load("crh3-learning").scenario
+    assert whole.run_length is not None
+    assert less.run_length is None
+    assert less.sensors.speed_noise_m_s == 0.0
+    assert less.sensors.position_step_m == whole.sensors.position_step_m
+    # What this file states itself counts.
+    again = write(
+        'base = "less.toml"\nunset = ["sensors"]\n[sensors]\nlocation = "front"', "a.toml"
+    )
+    assert load(again).scenario.sensors.position_step_m == 0.0
+    assert load("crh3-learning").scenario == whole
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('base = "subway"\nunset = ["run_length"]', "key unset: the base has no run_length"),
+        ('base = "subway"\nunset = ["law.x"]', "key unset: the base has no law.x"),
+        ('base = "subway"\nunset = "atp"', "key unset: expected a list of keys"),
+        ('unset = ["atp"]', "key unset: there is no base"),
+        ('base = "subway"\nunset = ["period_s"]', "Object missing required field `period_s`"),
+    ],
+)
+def test_what_cannot_be_unset_is_named(write, text, says):
+    with pytest.raises(ScenarioError, match=re.escape(says)):
+        load(write(text))
+
+
+def test_a_byte_order_mark_and_a_name_in_capitals_are_read(tmp_path):
+    below = tmp_path / "BELOW.TOML"
+    below.write_bytes(b'\xef\xbb\xbfbase = "subway-fast"\r\ntitle = "Tr\xc3\xa4ge Bremse"\r\n')
+    above = tmp_path / "above.Toml"
+    above.write_text('base = "BELOW.TOML"\nruns = 2\n')
+    assert load(str(below)).scenario.title == load(str(above)).scenario.title == "Träge Bremse"
 
 
 def test_a_base_that_leads_back_to_itself_is_refused(write):

@@ -164,8 +164,10 @@ def _plain(value: Any) -> Any:
 
 
 def pareto(rows: list[dict[str, Any]]) -> list[int]:
-    """Indices of the rows that no other beats in energy and error, by rising energy."""
-    order = sorted(range(len(rows)), key=lambda i: (rows[i][ENERGY], rows[i][ERROR]))
+    """Indices of the rows that no other beats in energy and error, by rising energy; a row without
+    an error has no part in it."""
+    known = [index for index, row in enumerate(rows) if row[ERROR] is not None]
+    order = sorted(known, key=lambda i: (rows[i][ENERGY], rows[i][ERROR]))
     front: list[int] = []
     for index in order:
         if not front or rows[index][ERROR] < rows[front[-1]][ERROR]:
@@ -196,7 +198,8 @@ LABELS = (((7, 3), "left"), ((-7, -9), "right"), ((7, -9), "left"), ((-7, 3), "r
 def plot(path: Path, loaded: Loaded, rows: list[dict[str, Any]], keys: list[str]) -> None:
     """Energy against error, one point a row; the Pareto front as a line. PNG or SVG by suffix.
 
-    What is varied last labels the points, what is varied before makes series of them.
+    Rows without an error are left out. What is varied last labels the points, what is varied
+    before makes series of them.
     """
     import matplotlib
     from matplotlib.figure import Figure
@@ -218,6 +221,8 @@ def plot(path: Path, loaded: Loaded, rows: list[dict[str, Any]], keys: list[str]
 
 def _draw(figure: Any, loaded: Loaded, rows: list[dict[str, Any]], keys: list[str]) -> None:
     axes = figure.subplots()
+    last = f", run {rows[0]['run']}"
+    rows = [row for row in rows if row[ERROR] is not None]
     front = [rows[index] for index in pareto(rows)]
     axes.plot([r[ENERGY] for r in front], [r[ERROR] for r in front], "-", color="0.8", zorder=1)
     series: dict[str, list[dict[str, Any]]] = {}
@@ -242,7 +247,7 @@ def _draw(figure: Any, loaded: Loaded, rows: list[dict[str, Any]], keys: list[st
     axes.set_yscale("log")
     axes.set_xlabel("traction energy of the last run [kWh/t]")
     axes.set_ylabel("rms position error of the last run [m]")
-    axes.set_title(f"{loaded.name}: energy against error, run {rows[0]['run']}", fontsize=11)
+    axes.set_title(f"{loaded.name}: energy against error{last}", fontsize=11)
     axes.grid(True, which="both", color="0.92")
     axes.set_axisbelow(True)
     axes.margins(x=0.12)

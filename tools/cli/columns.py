@@ -72,7 +72,8 @@ def cell(row: dict[str, Any], key: str, factor: float, text: str) -> str:
     if isinstance(value, int):
         return text.format(value)
     scaled = value * factor
-    return f"{scaled:,.0f}" if LARGE <= abs(scaled) < math.inf else text.format(scaled)
+    shown = f"{scaled:,.0f}" if LARGE <= abs(scaled) < math.inf else text.format(scaled)
+    return shown if shown.strip("-0.,") else shown.lstrip("-")  # no -0.0000
 
 
 def headings(columns: Sequence[tuple[str, str, float, str]]) -> list[Column]:

@@ -2,6 +2,7 @@
 
     messages.md        every message of the DBC
     command-line.md    every command, with its arguments and options
+    scenario.md        every key of a scenario
 
 and with files of `ato-hil claims PAPER --json FILE` the tables of the pages papers/PAPER.md:
 `python -m ato_hil.tools.cli.docs claims-cailc.json …`.
@@ -23,6 +24,7 @@ from cantools.database.can import Message, Signal
 from typer.main import get_command
 
 from ato_hil.can_dbc.codec import database
+from ato_hil.tools.cli import scenario_pages
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     EXIT_ENDED_EARLY,
@@ -224,6 +226,7 @@ def main(arguments: Sequence[str]) -> None:
     """Writes the pages."""
     write_text(FOLDER / "messages.md", messages())
     write_text(FOLDER / "command-line.md", command_line())
+    write_text(FOLDER / "scenario.md", scenario_pages.page())
     for name in arguments:
         content = json.loads(Path(name).read_text(encoding="utf-8"))
         page = FOLDER / "papers" / f"{content['paper']}.md"

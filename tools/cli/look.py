@@ -15,7 +15,7 @@ from ato_hil.tools.cli.console import (
     one_line_for_bad_input,
     say,
 )
-from ato_hil.tools.cli.options import Picture, ScenarioName
+from ato_hil.tools.cli.options import SEED_MAX, Picture, ScenarioName
 from ato_hil.tools.cli.output import console
 
 
@@ -48,7 +48,7 @@ def profile(
     run: Annotated[
         int, typer.Option(min=0, help="Run whose timetable to print; 0: as planned.")
     ] = 0,
-    seed: Annotated[int, typer.Option(help="Seed of that run.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Seed of that run.")] = 1,
 ) -> None:
     """Print the reference profile and the limit of each control period as CSV, for nodes of your
     own."""

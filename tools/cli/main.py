@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli import buses, clean, compare, export, look, prove, run
+from ato_hil.tools.cli import buses, clean, compare, export, look, prove, run, scenarios
 from ato_hil.tools.cli.console import EXIT_ENDED_EARLY, end_as_with_ctrl_c, fail
 from ato_hil.tools.cli.options import Viewer
 from ato_hil.tools.cli.output import ignore_other_tools, streams
@@ -29,6 +29,8 @@ COMMANDS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("figures", look.figures),
         ("report", look.report),
         ("list", look.list_scenarios),
+        ("show", scenarios.show),
+        ("new", scenarios.new),
         ("doctor", buses.doctor),
         ("clean", clean.clean),
     ),

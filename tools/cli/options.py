@@ -58,7 +58,8 @@ ScenarioName = Annotated[
 ]
 LawName = Annotated[str | None, typer.Option(help="Control law; the scenario's by default.")]
 Runs = Annotated[int | None, typer.Option(min=1, help="Runs in a row; the scenario's by default.")]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of noise and disturbance.")]
+SEED_MAX = 2**63 - 1  # what every generator takes as it is
+Seed = Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Seed of noise and disturbance.")]
 Overwrite = Annotated[
     bool,
     typer.Option(

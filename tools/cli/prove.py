@@ -19,7 +19,7 @@ from ato_hil.tools.cli.console import (
     say,
     working,
 )
-from ato_hil.tools.cli.options import Mode, Overwrite
+from ato_hil.tools.cli.options import SEED_MAX, Mode, Overwrite
 from ato_hil.tools.cli.output import console
 from ato_hil.tools.cli.tables import Column, Row, show
 
@@ -135,7 +135,7 @@ def threats(
     ] = None,
     mode: Annotated[Mode, typer.Option(help="sil, or hil: over a bus as well.")] = Mode.sil,
     bus: Annotated[str, typer.Option(help="Of mode hil, as for `run`.")] = "auto",
-    seed: Annotated[int, typer.Option(min=0, help="Of the faults.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Of the faults.")] = 1,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -226,7 +226,7 @@ def noise(
         int, typer.Option(min=1, help="Random words into mailboxes, without a bus.")
     ] = 10_000_000,
     bus: Annotated[str, typer.Option(help="As for `run`.")] = "auto",
-    seed: Annotated[int, typer.Option(min=0, help="Of noise and scenario.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Of noise and scenario.")] = 1,
 ) -> None:
     """Send random frames beside a run (HIL), and say whether a force changed; then put random words
     into the mailboxes of firmware and plant."""
@@ -269,7 +269,9 @@ def noise(
 
 def endurance(
     times: Annotated[int, typer.Option(min=1, help="Sessions.")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of victims and moments.")] = 1,
+    seed: Annotated[
+        int, typer.Option(min=0, max=SEED_MAX, help="Seed of victims and moments.")
+    ] = 1,
     out: Annotated[
         Path | None,
         typer.Option(

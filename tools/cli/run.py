@@ -120,7 +120,8 @@ class Screen:
             check_keys(self.expected, row)
         self.rows.append(row)
         self.faults += len(row["faults"])
-        last = f"last: {row['max_position_error_m'] * 1e3:.2f} mm, {self.faults} faults"
+        error = cell(row, "max_position_error_m", 1e3, "{:.2f}")
+        last = f"last: {error} mm, {self.faults} faults"
         self.bar.update(
             self.task, completed=(row["run"] - self.runs[0] + 1) * self.ticks, last=last
         )

@@ -1,17 +1,21 @@
 """One row of the summary: what a run was like, from the true state of the plant.
 
 Errors are of the true state against the reference, over the scenario's window; everything else is
-over the whole run.
+over the whole run. What a run does not have is None: errors without a window, the stop error of a
+train that still moves at the end, a margin to a limit where nothing limits.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from ato_hil.plant_sim.atp import EMERGENCY_BRAKE, SERVICE_BRAKE
 from ato_hil.plant_sim.scenario import Loaded
+
+STOPPED_M_S = 0.1  # below it a train counts as stopped at the end of its run
 
 
 def run_metrics(
@@ -21,7 +25,7 @@ def run_metrics(
 
     `truth` [ticks] of plant.TRUTH; `command_n` [ticks] total force commanded, N; `alpha` (1/s)
     weighs the position error in the augmented error delta = alpha e + ed, None for laws without it
-    (delta is then reported as null).
+    (there is no delta then).
     """
     scenario = loaded.scenario
     ticks = len(truth)
@@ -35,9 +39,11 @@ def run_metrics(
     mass = scenario.train.mass_kg
     tonnes = mass / 1000.0
     work = {
-        name: float(truth[f"{name}_j"][-1]) / 3.6e6 / tonnes
+        name: float(truth[f"{name}_j"][-1]) / 3.6e6 / tonnes + 0.0  # no -0
         for name in ("traction", "braking", "recuperated")
     }
+    margin = np.min(truth["permitted_speed_m_s"] - truth["speed_m_s"])
+    stopped = abs(truth["speed_m_s"][-1]) < STOPPED_M_S
     jerk = np.diff(command_n) / (mass * scenario.period_s)
     row = {
         "ticks": ticks,
@@ -47,10 +53,11 @@ def run_metrics(
         "rms_speed_error_m_s": _rms(ed),
         "rms_position_error_m": _rms(e),
         "rms_delta_m_s": None if alpha is None else _rms(alpha * e + ed),
-        "stop_error_m": float(position_error[-1]),
+        "stop_error_m": float(position_error[-1]) if stopped else None,
+        "end_position_error_m": float(position_error[-1]),
         "max_acceleration_m_s2": _peak(truth["acceleration_m_s2"]),
         "rms_command_jerk_m_s3": _rms(jerk),
-        "overspeed_margin_m_s": float(np.min(truth["permitted_speed_m_s"] - truth["speed_m_s"])),
+        "overspeed_margin_m_s": float(margin) if math.isfinite(margin) else None,
         "energy_kwh_per_t": work["traction"],
         "braking_kwh_per_t": work["braking"],
         "recuperated_kwh_per_t": work["recuperated"],
@@ -82,10 +89,14 @@ def _rises(flags: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.diff(flags, prepend=False) & flags)
 
 
-def _peak(values: np.ndarray) -> float:
-    return float(np.max(np.abs(values))) if len(values) else 0.0
+def _peak(values: np.ndarray) -> float | None:
+    return _finite(np.max(np.abs(values))) if len(values) else None
 
 
-def _rms(values: np.ndarray) -> float:
+def _rms(values: np.ndarray) -> float | None:
     # sqrt of a mean of squares by pairwise sums: NumPy's own, the same on every machine.
-    return float(np.sqrt(np.mean(values * values))) if len(values) else 0.0
+    return _finite(np.sqrt(np.mean(values * values))) if len(values) else None
+
+
+def _finite(value: Any) -> float | None:
+    return float(value) if math.isfinite(value) else None

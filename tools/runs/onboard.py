@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -18,7 +19,12 @@ from ato_hil.controller.neighbours import NeighbourSettings
 from ato_hil.controller.node import Controller, build
 from ato_hil.controller.quantise import CalibrationError, Characteristic, Vehicle
 from ato_hil.controller.rebasing import RebasingSettings
-from ato_hil.controller.registry import is_file, law_label, load_law
+from ato_hil.controller.registry import (
+    is_file,
+    law_label,
+    law_names,
+    load_law,
+)
 from ato_hil.plant_sim import track
 from ato_hil.plant_sim.scenario import Loaded, Scenario, ScenarioError
 from ato_hil.plant_sim.trains import point
@@ -33,6 +39,7 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
     A law in a file of its own may do without a table of gains: its defaults count.
     """
     scenario = loaded.scenario
+    _check_law_names(loaded, law)
     gains = scenario.laws.get(law_label(law), {} if is_file(law) else None)
     if gains is None:
         known = expected(law, sorted(scenario.laws))
@@ -57,6 +64,21 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
         )
     except CalibrationError as error:
         raise ScenarioError(f"{loaded.path}: {error}") from None
+
+
+def _check_law_names(loaded: Loaded, law: str) -> None:
+    """Raises ScenarioError for a table of gains that no law has: there is none of that name, nor a
+    law of one's own beside the scenario or in the current folder."""
+    known = [*law_names(), law_label(law)]
+    for name in loaded.scenario.laws:
+        file = f"{name.replace('-', '_')}.py"
+        if name not in known and not any(
+            (at / file).is_file() for at in (loaded.path.parent, Path())
+        ):
+            raise ScenarioError(
+                f"{loaded.path}: key laws.{name}: there is no such law,"
+                f" {expected(name, law_names())}, or a file {file} beside the scenario"
+            )
 
 
 def controllers_for(trains: list[Loaded], law: str) -> list[Controller]:
@@ -111,7 +133,7 @@ def _map_sections(scenario: Scenario) -> list[tuple[float, float, float]]:
             factor * float(section["resistance_n_per_kn"]),
             factor * float(section["slope_n_per_kn_m"]),
         )
-        for section in track.sections(scenario.track)[1:]
+        for section in track.sections(track.known(scenario.track))[1:]
     ]
 
 
@@ -139,8 +161,10 @@ def run_numbers(law: str, runs: int, learned: int = -1) -> range:
 
 
 def error_weight(loaded: Loaded, law: str) -> float | None:
-    """alpha of the augmented error: the law's own, else that of the scenario's default law, else
-    None."""
+    """alpha (1/s) of the augmented error: the law's own, else that of the scenario's default law,
+    else None. The alpha of a line's laws is a barrier's, in m^2/s^2."""
+    if loaded.scenario.line is not None:
+        return None
     for name in (law, loaded.scenario.law):
         alpha = loaded.scenario.laws.get(law_label(name), {}).get("alpha")
         if alpha is not None:

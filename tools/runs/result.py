@@ -12,7 +12,7 @@ import numpy as np
 
 from ato_hil.can_dbc.errors import InputError
 from ato_hil.can_dbc.faults import Event
-from ato_hil.plant_sim.scenario import Loaded
+from ato_hil.plant_sim.scenario import Loaded, in_run
 from ato_hil.tools.runs import summary_row
 from ato_hil.tools.runs.frames import LineDigest, digest_of_line
 
@@ -75,30 +75,36 @@ class Run:
     @cached_property
     def metrics(self) -> dict[str, Any]:
         """As `summary_row.run_row`; measured when it is first asked for."""
-        return summary_row.run_row(self.members, self.law, self.frames, self.truths)
+        return summary_row.run_row(
+            [in_run(member, self.number) for member in self.members],
+            self.law,
+            self.frames,
+            self.truths,
+        )
 
     @property
     def row(self) -> dict[str, Any]:
-        """The row of summary.json."""
+        """The row of summary.json. Its faults are those that the controller has seen, and trains
+        that came too near to each other or too far apart."""
         if self.recorded is not None:
             return self.recorded
+        strayed = summary_row.separation_faults(self.members, self.law, self.metrics)
+        faults = [[*ours, *more] for ours, more in zip(self.faults, strayed, strict=True)]
         row = {
             "run": self.number,
             **self.metrics,
             "ticks_per_s": self.ticks / self.seconds,
             "frames_lost": self.frames_lost,
             **self.punctuality,
-            "faults": self.faults[0],
+            "faults": faults[0],
         }
         if "trains" in row:
             row["faults"] = [
-                f"train {train}: {name}"
-                for train, names in enumerate(self.faults, 1)
-                for name in names
+                f"train {train}: {name}" for train, names in enumerate(faults, 1) for name in names
             ]
             row["trains"] = [
                 {**of_train, "faults": names}
-                for of_train, names in zip(row["trains"], self.faults, strict=True)
+                for of_train, names in zip(row["trains"], faults, strict=True)
             ]
         return row
 

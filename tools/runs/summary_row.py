@@ -34,7 +34,7 @@ def run_row(
     if len(rows) == 1:
         return rows[0]
     columns = line_columns(members, law, frames, truths)
-    errors = [row["max_position_error_m"] for row in rows]
+    errors = [row["max_position_error_m"] or 0.0 for row in rows]
     for train, (row, column) in enumerate(zip(rows, columns, strict=True)):
         separation = column["separation_m"]
         row["min_separation_m"] = float(separation.min()) if train else None
@@ -46,6 +46,30 @@ def run_row(
     worst = {key: _worst(key, [row[key] for row in rows]) for key in rows[0]}
     worst["trains"] = [{"train": number, **row} for number, row in enumerate(rows, start=1)]
     return worst
+
+
+def separation_faults(members: list[Loaded], law: str, row: dict[str, Any]) -> list[list[str]]:
+    """What each train's distance from the one ahead did that it must not: `separation` where it
+    left (l1, l2), as `control.rebasing` or the gains of the law have them."""
+    faults: list[list[str]] = []
+    for member, of_train in zip(members, row.get("trains", [{}]), strict=True):
+        bounds = _separation_bounds(member, law)
+        least, largest = of_train.get("min_separation_m"), of_train.get("max_separation_m")
+        left = bounds and least is not None and not bounds[0] < least <= largest < bounds[1]
+        faults.append(["separation"] if left else [])
+    return faults
+
+
+def _separation_bounds(loaded: Loaded, law: str) -> tuple[float, float] | None:
+    scenario = loaded.scenario
+    tables = (
+        scenario.control.rebasing,
+        *(scenario.laws.get(n) for n in (law_label(law), scenario.law)),
+    )
+    for table in tables:
+        if table and "l1_m" in table and "l2_m" in table:
+            return float(table["l1_m"]), float(table["l2_m"])
+    return None
 
 
 def _worst(key: str, values: list[Any]) -> Any:

@@ -192,6 +192,11 @@ class Session:
         if recording is not None:
             recording.add(run.number, run.frames[0])
         row = run.row
+        if row["max_position_error_m"] is None:
+            self.listener.note(
+                f"run {run.number}: it ended before the window of [metrics] began,"
+                " so it has no errors"
+            )
         self.summary["runs"].append(row)
         self.listener.row(row)
 

@@ -27,7 +27,7 @@ LARGEST = {
     "S": 0.5,
     "estimate": True,
     "kfv": 2000.0,
-    "kfs": -2000.0,
+    "kfs": 2000.0,
     "initial": (2000.0, 2000.0),
     "slope_max": 1.0,
 }

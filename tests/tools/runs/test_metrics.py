@@ -1,11 +1,17 @@
-"""What the summary says of ATP."""
+"""What the summary says of a run: its errors, where there are any, and ATP."""
+
+import json
 
 import numpy as np
 import pytest
 
 from ato_hil.plant_sim import atp
 from ato_hil.plant_sim.plant import TRUTH
-from ato_hil.tools.runs.metrics import supervision
+from ato_hil.plant_sim.scenario import load, members, overlaid
+from ato_hil.tools.runs.files import write_json
+from ato_hil.tools.runs.metrics import run_metrics, supervision
+from ato_hil.tools.runs.onboard import error_weight
+from ato_hil.tools.runs.summary_row import separation_faults
 
 
 def test_interventions_and_the_largest_speeds_above_the_curves():
@@ -45,3 +51,61 @@ def test_a_run_without_intervention_under_a_fixed_margin():
     assert row["first_intervention_tick"] is None
     assert row["atp_interventions"] == row["atp_emergency_brakes"] == 0
     assert "over_service_brake_m_s" not in row
+
+
+ERRORS = ("max_speed_error_m_s", "max_position_error_m", "rms_speed_error_m_s", "max_delta_m_s")
+
+
+def on_time(loaded, ticks=None):
+    """The truth of a run that keeps its timetable, as far as `ticks`."""
+    truth = np.zeros(ticks or loaded.ticks, TRUTH)
+    truth["position_m"] = loaded.profile.position_m[: len(truth)]
+    truth["speed_m_s"] = loaded.profile.speed_m_s[: len(truth)]
+    truth["permitted_speed_m_s"] = 30.0
+    return truth
+
+
+def row_of(loaded, truth):
+    return run_metrics(loaded, truth, np.zeros(len(truth)), 2.0)
+
+
+def test_a_run_cut_before_its_window_has_no_errors():
+    loaded = overlaid("subway-fast", {"metrics": {"from": 100.0}})
+    assert {row_of(loaded, on_time(loaded, 5000))[key] for key in ERRORS} == {None}
+    assert {row_of(loaded, on_time(loaded, 12000))[key] for key in ERRORS} == {0.0}
+
+
+def test_only_a_train_that_stopped_has_a_stop_error():
+    loaded = load("subway-fast")
+    truth = on_time(loaded)
+    truth["position_m"] += 0.25
+    assert row_of(loaded, truth)["stop_error_m"] == 0.25
+    moving = row_of(loaded, truth[:9000])
+    assert (moving["stop_error_m"], moving["end_position_error_m"]) == (None, 0.25)
+
+
+def test_a_summary_is_json_without_nan_and_minus_nothing(tmp_path):
+    loaded = load("subway-fast")
+    truth = on_time(loaded)
+    truth["permitted_speed_m_s"] = np.inf
+    truth["traction_j"] = -0.0
+    row = row_of(loaded, truth)
+    assert row["overspeed_margin_m_s"] is None
+    assert str(row["energy_kwh_per_t"]) == "0.0"
+    write_json(tmp_path / "x.json", {"rows": [row, {"x": [float("nan"), (float("inf"), 1.0)]}]})
+    found = json.loads((tmp_path / "x.json").read_text(), parse_constant=pytest.fail)
+    assert found["rows"][1] == {"x": [None, [None, 1.0]]}
+
+
+def test_the_alpha_of_a_barrier_weighs_no_error():
+    assert error_weight(load("subway"), "pid") == 2.0
+    assert error_weight(load("line"), "mtcc") is None
+
+
+def test_a_separation_outside_its_bounds_is_a_fault_of_the_train_behind():
+    trains = members(load("line"))[:4]
+    spans = [(None, None), (450.0, 520.0), (399.9, 520.0), (450.0, 600.1)]
+    rows = [{"min_separation_m": low, "max_separation_m": high} for low, high in spans]
+    found = separation_faults(trains, "mtcc", {"trains": rows})
+    assert found == [[], [], ["separation"], ["separation"]]
+    assert separation_faults(members(load("subway")), "cailc", {}) == [[]]

@@ -63,6 +63,13 @@ def short(
     return "short.toml"
 
 
+# Of a run and of its trains: where they stand, and what their plant is.
+OF_ITS_OWN = """runs = 2
+start = { offsets_m = [0.0, 0.05], spread_m = 0.02 }
+changes = [{ from_run = 2, sensors = { speed_noise_m_s = 0.01 }, train = { mass_kg = 205e3 } }]
+"""
+
+
 def summary(folder: Path) -> dict:
     return json.loads((folder / "summary.json").read_text())
 
@@ -76,7 +83,7 @@ def channel(tmp_path: Path) -> str:
 
 
 def test_hil_with_a_bus_for_each_train_gives_the_bits_of_sil(ato_hil, tmp_path: Path) -> None:
-    name = short(tmp_path, duration_s=8.0, more="runs = 2")
+    name = short(tmp_path, duration_s=8.0, more=OF_ITS_OWN)
     sil = ato_hil("run", name, "--mode", "sil", "--out", "sil", cwd=tmp_path)
     assert sil.returncode == 0, sil.stderr
     hil = ato_hil("run", name, "--bus", channel(tmp_path), "--out", "hil", cwd=tmp_path)

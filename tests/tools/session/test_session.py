@@ -152,7 +152,7 @@ def test_the_summary_has_its_stable_keys(ato_hil, short: Path, tmp_path: Path) -
         *("rms_speed_error_m_s", "rms_position_error_m", "stop_error_m", "max_acceleration_m_s2"),
         *("rms_command_jerk_m_s3", "overspeed_margin_m_s", "energy_kwh_per_t", "ticks_per_s"),
         *("braking_kwh_per_t", "recuperated_kwh_per_t", "net_energy_kwh_per_t"),
-        "faults",
+        *("faults", "end_position_error_m"),
     } <= set(found["runs"][0])
     assert found["runs"][0]["ticks"] == 2001
 
@@ -190,6 +190,7 @@ def test_learning_goes_on_from_a_memory_file(ato_hil, short: Path, tmp_path: Pat
         (["run", "subway", "--law", "magic"], "law 'magic' is unknown, expected one of"),
         (["run", "wrong.toml"], "wrong.toml: key actuator.force_max_m_s2"),
         (["run", "extra.toml"], "extra.toml: key sensors: Object contains unknown field `colour`"),
+        (["run", "misspelt.toml"], "laws.calic: there is no such law, did you mean cailc?"),
         (["run", "gains.toml"], "laws.cailc: Object contains unknown field `gamma_ray`"),
         (["run", "range.toml"], "laws.cailc: alpha: 1e+09 is outside what the firmware holds"),
         (["run", "plan.toml"], "plan.toml: [profile]:"),
@@ -209,6 +210,7 @@ def test_bad_input_is_one_clear_line(
     wrong = {
         "wrong": '[actuator]\nforce_max_m_s2 = "much"',
         "extra": '[sensors]\ncolour = "red"',
+        "misspelt": "[laws.calic]\nalpha = 1.0",
         "gains": "[laws.cailc]\ngamma_ray = 1.0",
         "range": "[laws.cailc]\nalpha = 1e9",
         "plan": "[profile]\ndistance_m = 99.0",

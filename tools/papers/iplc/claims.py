@@ -48,7 +48,7 @@ def contraction(rows: list[dict[str, Any]]) -> float:
 
 def per_km(rows: list[dict[str, Any]]) -> float:
     """Energy of the last run for each kilometre that it came, kWh/t/km."""
-    return last(rows, ENERGY) / (36.28 + last(rows, "stop_error_m") / 1e3)
+    return last(rows, ENERGY) / (36.28 + last(rows, "end_position_error_m") / 1e3)
 
 
 CLAIMS = [
@@ -82,8 +82,8 @@ CLAIMS = [
           lambda: last(case("VII"), ENERGY) / last(case("VI"), ENERGY)),
     Claim("larger S costs less energy: S = 2 over S = 1 (VIII, VII)", "Fig. 7", "", -inf, 0.98,
           True, lambda: last(case("VIII"), ENERGY) / last(case("VII"), ENERGY)),
-    Claim("the train still arrives at S = 2 (VIII): stop error", "not said", "m", -10.0, 10.0,
-          False, lambda: last(case("VIII"), "stop_error_m")),
+    Claim("the train still arrives at S = 2 (VIII): error at the end", "not said", "m", -10.0, 10.0,
+          False, lambda: last(case("VIII"), "end_position_error_m")),
     Claim("larger S costs less energy for each km: S = 2 over S = 0 (VIII, VI)", "not said", "",
           -inf, 0.9, False, lambda: per_km(case("VIII")) / per_km(case("VI"))),
     Claim("S saves energy where the position is weighted (ours, m = h = 0, S = 0.5 over 0)",

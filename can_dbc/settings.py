@@ -1,0 +1,47 @@
+"""Settings from TOML files: how they are read, and whether their numbers can be calculated with."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+INT_MAX = 2**63 - 1
+
+
+class Trouble(NamedTuple):
+    """What is wrong, and where."""
+
+    key: str  # dotted, "" for the whole
+    text: str
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file, with or without a byte-order mark. Raises ValueError with what is
+    wrong with the file."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"not valid TOML: {error}") from None
+    except OSError as error:
+        raise ValueError(f"cannot be read: {error.strerror}") from None
+
+
+def strange_number(content: Any, key: str = "") -> Trouble | None:
+    """The first number of a file that is none to calculate with: not finite, or too large for 64
+    bits. None if all are."""
+    if isinstance(content, dict):
+        places: Iterable[tuple[str, Any]] = (
+            (f"{key}.{name}" if key else str(name), value) for name, value in content.items()
+        )
+    elif isinstance(content, list):
+        places = ((f"{key}[{index}]", value) for index, value in enumerate(content))
+    elif isinstance(content, float) and not math.isfinite(content):
+        return Trouble(key, f"{content:g}, expected a finite number")
+    elif isinstance(content, int) and abs(content) > INT_MAX:
+        return Trouble(key, "expected a whole number of at most 64 bits")
+    else:
+        return None
+    return next(filter(None, (strange_number(value, name) for name, value in places)), None)
