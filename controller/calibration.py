@@ -116,6 +116,7 @@ class Line:
     behind: bool
     neighbours: neighbours.NeighbourSettings
     rebasing: rebasing.RebasingSettings | None = None  # none: it stays on its timetable
+    atp_brake_m_s2: float = 1.2  # the most that the emergency brake of a train gives
 
 
 @dataclass(frozen=True)
@@ -327,7 +328,10 @@ def _line(params: np.ndarray, line: Line, period_s: float) -> None:
     if line.rebasing is not None:
         try:
             params["rebasing"] = rebasing.calibrate(
-                line.rebasing, period_s=period_s, spacing_m=line.spacing_m
+                line.rebasing,
+                period_s=period_s,
+                spacing_m=line.spacing_m,
+                atp_brake_m_s2=line.atp_brake_m_s2,
             )
         except CalibrationError as error:
             raise CalibrationError(f"control.rebasing: {error}") from None

@@ -49,6 +49,7 @@ from ato_hil.controller.quantise import CalibrationError, fixed
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
+CATCHING_UP_M_S2 = 0.2  # brake beyond that of an emergency
 STANDSTILL = 1 << 14  # m/s, Q24: 1 mm/s
 Q_OFFSET = 40  # m
 Q_OFFSET_SPEED = 32  # m/s
@@ -101,19 +102,34 @@ class RebasingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     d: NotNegative = 1e7  # m^4/s^2, of the separation's potential
     separation_max_m_s2: NotNegative = 0.8  # its share of a_r
     consensus_1_s: NotNegative = 1.0  # h
-    emergency_brake_m_s2: NotNegative = 1.0  # a_e
-    brake_max_m_s2: Positive = 1.2  # -a_min
+    # a_e; none: the most that ATP's emergency brake gives, so that no train counts on less than the
+    # one ahead can do
+    emergency_brake_m_s2: NotNegative | None = None
+    # -a_min; none: a_e + 0.2, so that a train that heard of a brake late makes up for it
+    brake_max_m_s2: Positive | None = None
     traction_max_m_s2: Positive = 0.8  # a_max
     speed_max_m_s: Positive  # v_max
     return_gain_1_s2: NotNegative = 0.001  # g
     return_within_m: NotNegative = 20.0
 
 
-def calibrate(settings: RebasingSettings, *, period_s: float, spacing_m: float) -> np.ndarray:
-    """PARAMS, shape (1,), of a train that may re-base; all zero is one that may not. Raises
-    CalibrationError if a number does not fit."""
+def calibrate(
+    settings: RebasingSettings, *, period_s: float, spacing_m: float, atp_brake_m_s2: float
+) -> np.ndarray:
+    """PARAMS, shape (1,), of a train that may re-base; all zero is one that may not.
+    `atp_brake_m_s2` is the most that ATP's emergency brake gives. Raises CalibrationError if a
+    number does not fit."""
     params = np.zeros(1, PARAMS)
     gain = settings.return_gain_1_s2
+    emergency, brake_max = settings.emergency_brake_m_s2, settings.brake_max_m_s2
+    if emergency is None:
+        emergency = atp_brake_m_s2
+    if brake_max is None:
+        brake_max = emergency + CATCHING_UP_M_S2
+    if brake_max < emergency:
+        raise CalibrationError(
+            f"brake_max_m_s2 is {brake_max:g}, expected emergency_brake_m_s2 or more, {emergency:g}"
+        )
     params["enabled"] = 1
     params["separation"] = separation.calibrate(
         l1_m=settings.l1_m,
@@ -134,8 +150,8 @@ def calibrate(settings: RebasingSettings, *, period_s: float, spacing_m: float) 
         ("consensus", settings.consensus_1_s, 24, 32),
         ("return_gain", gain, 30, 27),
         ("return_damping", 2 * math.sqrt(gain), 24, 32),
-        ("emergency", -settings.emergency_brake_m_s2, 27, 32),
-        ("brake_max", settings.brake_max_m_s2, 27, 32),
+        ("emergency", -emergency, 27, 32),
+        ("brake_max", brake_max, 27, 32),
         ("traction_max", settings.traction_max_m_s2, 27, 32),
         ("speed_max", settings.speed_max_m_s, 24, 32),
         ("period", period_s, 30, 28),

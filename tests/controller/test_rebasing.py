@@ -14,15 +14,34 @@ from ato_hil.controller.rebasing import OFFSET_MAX, OFFSET_SPEED_MAX, RebasingSe
 
 PERIOD_S = 0.01
 S0 = 510.0
-SETTINGS = {"error_max_m": 0.15, "l1_m": 400.0, "l2_m": 600.0, "speed_max_m_s": 24.0}
+BOUNDS = {"error_max_m": 0.15, "l1_m": 400.0, "l2_m": 600.0, "speed_max_m_s": 24.0}
+SETTINGS = BOUNDS | {"emergency_brake_m_s2": 1.0, "brake_max_m_s2": 1.2}
 # The way back and the separation's push are tried by themselves.
 PLAIN = {"return_gain_1_s2": 0.0, "d": 0.0}
 
 
 def calibrated(**settings):
     return rebasing.calibrate(
-        RebasingSettings(**SETTINGS | settings), period_s=PERIOD_S, spacing_m=S0
+        RebasingSettings(**SETTINGS | settings), period_s=PERIOD_S, spacing_m=S0, atp_brake_m_s2=1.2
     )
+
+
+def test_it_counts_on_the_brake_that_atp_gives():
+    for stated, expected in (
+        ({}, (-1.3, 1.5)),
+        ({"emergency_brake_m_s2": 0.9}, (-0.9, 1.1)),
+        ({"brake_max_m_s2": 1.3}, (-1.3, 1.3)),
+    ):
+        params = rebasing.calibrate(
+            RebasingSettings(**BOUNDS | stated),
+            period_s=PERIOD_S,
+            spacing_m=S0,
+            atp_brake_m_s2=1.3,
+        )
+        found = params["emergency"][0] / 2**27, params["brake_max"][0] / 2**27
+        assert found == pytest.approx(expected)
+    with pytest.raises(CalibrationError, match="brake_max_m_s2 is 1, expected emergency_brake"):
+        calibrated(emergency_brake_m_s2=1.1, brake_max_m_s2=1.0)
 
 
 @step

@@ -100,6 +100,9 @@ def _line(loaded: Loaded) -> Line | None:
         rebasing=_settings("control.rebasing", control.rebasing, RebasingSettings)
         if control.rebasing is not None
         else None,
+        atp_brake_m_s2=max(
+            step.deceleration_m_s2 for step in loaded.scenario.atp.emergency_brake.steps
+        ),
     )
 
 

@@ -204,3 +204,33 @@ def test_the_default_line_shows_what_it_is_for() -> None:
 @pytest.mark.long
 def test_the_pid_is_far_from_the_barrier_law() -> None:
     assert error_m("line-pid", law=PID) > 10 * error_m("line-paper")
+
+
+EMERGENCY = """
+[line]
+faults = [{{ train = {train}, from = {at}, to = {to}, brake_m_s2 = 1.2, emergency = true }}]
+"""
+# The fastest stretches of the timetable; the brake is ATP's from the second on, latched.
+CASES = [(train, at) for at in (60.0, 75.0, 90.0) for train in (1, 2, 4, 5)]
+
+
+def keeps_the_separation(train: int, at: float, seed: int) -> None:
+    text = POOR_RADIO + EMERGENCY.format(train=train, at=at, to=at + 1)
+    row = run("line", text, seed=seed).row
+    assert row["min_separation_m"] > 425, (train, at, seed)
+    assert row["max_separation_m"] < 585, (train, at, seed)
+
+
+def test_the_separation_outlives_an_emergency_brake_of_atp() -> None:
+    """Over a radio 0.5 s late that loses 30 %."""
+    for train, at in ((2, 75.0), (5, 60.0)):  # the worst of all with seed 1
+        keeps_the_separation(train, at, 1)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("train", "at"), CASES)
+def test_the_separation_outlives_an_emergency_brake_of_atp_with_any_seed(
+    train: int, at: float
+) -> None:
+    for seed in SEEDS:
+        keeps_the_separation(train, at, seed)
