@@ -22,6 +22,7 @@ from ato_hil.can_dbc.errors import InputError
 from ato_hil.can_dbc.step import INTERPRETED
 from ato_hil.controller.registry import is_file
 from ato_hil.plant_sim.scenario import FOLDER
+from ato_hil.plant_sim.unusual import questions
 from ato_hil.tools.runs import can_logs, environment, locks
 from ato_hil.tools.runs.files import write_json, write_text
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
@@ -109,6 +110,10 @@ class Session:
             "machine": environment.machine(),
             "configuration": environment.configuration(loaded),
         }
+        if unusual := questions(loaded):
+            self.summary["unusual"] = unusual
+            for text in unusual:
+                listener.note(f"{loaded.path}: {text}")
         if options.faults is not None:
             self.summary["faults_file"] = options.faults.read_text(encoding="utf-8")
             self.summary["faults_injected"] = {}

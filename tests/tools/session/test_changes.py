@@ -37,3 +37,18 @@ def test_changes_starts_and_swings_give_the_same_bits_over_a_bus(
     for one, other in zip(summaries[0]["runs"], summaries[1]["runs"], strict=True):
         del one["ticks_per_s"], other["ticks_per_s"]
         assert one == other
+
+
+def test_a_value_that_no_train_has_is_questioned_once_and_in_the_summary(
+    ato_hil, short_text: str, tmp_path: Path
+) -> None:
+    text = short_text + "[actuator]\njerk_max_m_s3 = 40.0\n"
+    (tmp_path / "mine.toml").write_text(text)
+    arguments = ["run", "mine.toml", "--mode", "sil", "--no-trace", "--out", "out"]
+    done = ato_hil(*arguments, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    said = "actuator.jerk_max_m_s3: 40 m/s^3 is unusual"
+    assert " ".join((done.stdout + done.stderr).split()).count(said) == 1
+    (line,) = json.loads((tmp_path / "out" / "summary.json").read_text())["unusual"]
+    assert line.startswith(said)
+    assert ato_hil("report", "out", cwd=tmp_path).returncode == 0
