@@ -66,7 +66,7 @@ class MemorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     that learns along the track an int32 cell every pitch of its own, whatever this says."""
 
     decimation: int = 1  # control periods a cell
-    lead_ticks: int = 0
+    lead_ticks: int = 0  # what a tick learns from lies so far ahead
     interpolation: str = "hold"  # hold | linear
     storage: str = "int32"  # int32 | int16
 
@@ -76,7 +76,7 @@ class PlausibleSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
     speed_max_m_s: float = 127.0  # either way
     speed_jump_m_s: float = 0.5  # what noise may add from one sample to the next
-    acceleration_max_m_s2: float = 5.0
+    acceleration_max_m_s2: float = 5.0  # between samples, either way
     # Before the start and beyond the end of the timetable; none: what the sensor can say.
     position_margin_m: float | None = None
     position_jump_m: float = 1.0  # what noise may add
@@ -87,12 +87,12 @@ class PlausibleSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 class GuardSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What the guard tolerates and how it brakes; none turns a limit off."""
 
-    age_max_ticks: int = 10
+    age_max_ticks: int = 10  # an older message brakes
     counter_jump_max: int = e2e.DELTA_MAX  # MaxDeltaCounter of the end-to-end check
-    service_brake_m_s2: float = 0.8
-    emergency_brake_m_s2: float = 1.2
+    service_brake_m_s2: float = 0.8  # of the guard
+    emergency_brake_m_s2: float = 1.2  # of an emergency request; at least the service brake
     hold_brake_m_s2: float | None = None  # at standstill, while the timetable stands
-    standstill_m_s: float = 0.02
+    standstill_m_s: float = 0.02  # up to here the train stands
     overspeed_margin_m_s: float = 2 / 3.6  # above the permitted speed, before traction is cut
     brake_margin_m_s: float | None = None  # before the service brake comes on
     emergency_margin_m_s: float | None = None  # before an emergency request
@@ -100,7 +100,7 @@ class GuardSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     brake_ahead_s: float = 0.0  # the service brake comes on
     target_brake_m_s2: float | None = None  # counted on towards it; none: the service brake
     traction_max_m_s2: float | None = None  # of the command, as specific force
-    brake_max_m_s2: float | None = None
+    brake_max_m_s2: float | None = None  # likewise
     jerk_max_m_s3: float | None = None  # of the command; brakes of the guard have none
     acceleration_max_m_s2: float | None = None  # measured: above it the command does not grow
     plausible: PlausibleSettings = PlausibleSettings()

@@ -125,7 +125,7 @@ class Change(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """What plant and sensors are from a run on: tables on top of the scenario's, and of a line's
     members. The controller, its gradient map and the reference stay as they are."""
 
-    from_run: Annotated[int, msgspec.Meta(ge=1, le=RUNS_MAX)]
+    from_run: Annotated[int, msgspec.Meta(ge=1, le=RUNS_MAX)]  # the first run with it
     train: dict[str, Any] = {}  # keys of [train] to replace, but for model and the number of cars
     sensors: dict[str, Any] = {}  # keys of [sensors] to replace
     actuator: dict[str, Any] = {}  # keys of [actuator] to replace

@@ -33,8 +33,8 @@ class Swing(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     from_m: Place = 0.0  # where it begins, at 0
     to_m: Place  # where it ends
-    wavelength_m: Wavelength
-    amplitude_n_per_kn: Resistance
+    wavelength_m: Wavelength  # of a whole swing
+    amplitude_n_per_kn: Resistance  # largest, either way
 
     def __post_init__(self) -> None:
         if self.to_m <= self.from_m:
@@ -55,8 +55,8 @@ class Track(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     application: str = "point"  # point: at the front for the whole train; smeared: car by car
     interpolation: str = "hold"  # hold: constant from each position on; linear: straight in between
     averaged_over_m: Length = 0.0  # mean of the steps over so many metres behind the front
-    from_m: list[Place] = []
-    resistance_n_per_kn: list[Resistance] = []
+    from_m: list[Place] = []  # each place, rising
+    resistance_n_per_kn: list[Resistance] = []  # there; positive holds the train back
     swings: list[Swing] = []  # on top, and in no map: neither the controller's nor ATP's
 
     def __post_init__(self) -> None:
