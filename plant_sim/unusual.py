@@ -26,7 +26,7 @@ SPACING = Usual(20.0, np.inf, "m", "a train is longer")
 
 
 def questions(loaded: Any) -> list[str]:
-    """A line for each value of a ato_hil.plant_sim.scenario.Loaded far outside what trains do, its key
+    """A line for each value of a scenario (Loaded) far outside what trains do, its key
     first."""
     return [
         f"{key}: {value:g} {usual.unit} is unusual, expected"
