@@ -177,8 +177,8 @@ def test_the_controller_process_drives_with_the_library(ato_hil, built, tmp_path
 @pytest.mark.parametrize(
     ("scenario", "law", "reason"),
     [
-        (SCENARIO, "pid", "a library of law cailc, expected pid"),
-        ("subway-paper", LAW, "a library of scenario "),
+        (SCENARIO, "pid", "made for law cailc, expected pid"),
+        ("subway-paper", LAW, "made for scenario "),
     ],
 )
 def test_a_library_for_something_else_is_refused(built, scenario, law, reason):
@@ -194,7 +194,7 @@ def test_a_library_of_another_calibration_or_version_is_refused(built, monkeypat
     with pytest.raises(library.LibraryError, match="another calibration"):
         library.load(built, calibration)
     monkeypatch.setattr(library, "source_digest", lambda _law: "other")
-    with pytest.raises(library.LibraryError, match=r"a library of version .*, expected other"):
+    with pytest.raises(library.LibraryError, match=r"made for version .*, expected other"):
         library.load(built, calibration)
 
 
