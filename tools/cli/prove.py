@@ -101,7 +101,9 @@ def verify(
             for line in identity.renew(laws or law_names()):
                 say(line)
             return
-        if not fast:
+        if prove:
+            say("a proof for each train of each scenario: this takes minutes", "dim")
+        elif not fast:
             say("every check of every law that is asked for: this takes minutes", "dim")
         checks = table.prove(laws or []) if prove else table.run(laws or [], fast)
         with working("verifying") as update:

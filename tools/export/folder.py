@@ -54,7 +54,7 @@ def files(scenario: str, law: str | None) -> dict[str, str]:
             ]
         ),
         "CMakeLists.txt": firmware.cmake_file(fw),
-        "MISRA.md": firmware.text_of(misra.page(sources)),
+        "MISRA.md": firmware.text_of(misra.page(sources, firmware.banner(fw))),
     }
 
 

@@ -259,10 +259,12 @@ def places(files: dict[str, str]) -> dict[str, dict[str, list[int]]]:
     }
 
 
-def page(files: dict[str, str]) -> list[str]:
-    """Lines of MISRA.md for sources by name."""
+def page(files: dict[str, str], banner: list[str]) -> list[str]:
+    """Lines of MISRA.md for sources by name; `banner` says what they were made of."""
     lines = [
         "# MISRA C:2012",
+        "",
+        *banner,
         "",
         "What is not listed here is kept as far as cppcheck's addon looks (it has most rules",
         "that can be decided, not all). A reason holds for every place of a rule.",
