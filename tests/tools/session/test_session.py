@@ -233,8 +233,11 @@ def test_bad_input_is_one_clear_line(
     ("more", "says"),
     [
         ({"mode": "sil", "external": ("plant",)}, "needs mode hil, this is sil"),
-        ({"law": "pid", "external": ("controller",)}, "law and memory .* are its own"),
-        ({"memory": Path("m"), "external": ("controller",)}, "law and memory .* are its own"),
+        ({"law": "pid", "external": ("controller",)}, "law, memory and firmware .* are its own"),
+        (
+            {"memory": Path("m"), "external": ("controller",)},
+            "law, memory and firmware .* are its own",
+        ),
     ],
 )
 def test_options_that_do_not_go_together(tmp_path: Path, more: dict[str, Any], says: str) -> None:
