@@ -29,6 +29,7 @@ from ato_hil.plant_sim.profile import (
 
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Change = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 
 DISTANCE_TOLERANCE_M = 1e-3
@@ -79,14 +80,21 @@ class Ramp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class ProfilePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A run from standstill to standstill, and what it has to keep."""
+    """A run from standstill to standstill, and what it has to keep: as `ramps` state it, or with an
+    `objective`, found by `running` from line, train and timetable."""
 
-    duration_s: Positive
+    objective: Literal["time", "energy"] | None = None
+    duration_s: Positive | None = None  # none: that of least time, with objective "time"
     distance_m: Positive | None = None  # met within 1 mm; none: what the ramps give
     max_speed_m_s: Positive
     max_acceleration_m_s2: Positive
+    max_deceleration_m_s2: Positive | None = None  # with an objective; none: as the acceleration
     max_jerk_m_s3: Positive
-    ramps: tuple[Ramp, ...]
+    ramps: tuple[Ramp, ...] = ()
+    # With an objective: part of the train's forces that it uses, the rest is for control; and part
+    # of the braking work that counts as won back.
+    force_share: Share = 0.9
+    recuperated_share: Share = 0.0
     limits: tuple[SpeedLimit, ...] = ()  # none: no limit over time
     limit_above_m_s: Positive | None = None  # instead of `limits`: so much above the reference
     margin_m_s: NotNegative = 0.0  # to keep below `limits`
@@ -94,6 +102,14 @@ class ProfilePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     def __post_init__(self) -> None:
         if self.limits and self.limit_above_m_s is not None:
             raise PlanError("a plan takes only one of limits and limit_above_m_s")
+        if self.objective is None and (not self.ramps or self.duration_s is None):
+            raise PlanError("a plan needs ramps and duration_s, or an objective")
+        if self.objective is not None and (self.ramps or self.limits):
+            raise PlanError("a plan with an objective takes neither ramps nor limits over time")
+        if self.objective is not None and self.distance_m is None:
+            raise PlanError("a plan with an objective needs distance_m")
+        if self.objective and (self.objective == "time") != (self.duration_s is None):
+            raise PlanError('duration_s: expected with objective "energy", not with "time"')
 
 
 @dataclass(frozen=True)
@@ -138,8 +154,9 @@ def plan_profile(plan: ProfilePlan, period_s: float) -> np.ndarray:
     begin inside one tick. Raises PlanError if the plan cannot be met, ValueError for a period that
     the table cannot have.
     """
-    units = _units(period_s)
-    ticks = _whole_ticks(plan.duration_s, "duration_s", units)
+    assert plan.duration_s is not None
+    units = units_of(period_s)
+    ticks = whole_ticks(plan.duration_s, "duration_s", units)
     ramps = _place(plan, units, _solve_speed(plan, units))
     _check_ramps(plan, ramps, units)
 
@@ -150,7 +167,7 @@ def plan_profile(plan: ProfilePlan, period_s: float) -> np.ndarray:
         else:
             rows[round(ramp.start) : round(ramp.end)] += _sinusoid(ramp, units)
 
-    segments = _segments(rows)
+    segments = segments_of(rows)
     _check_profile(plan, evaluate(segments, period_s), units)
     return segments
 
@@ -162,8 +179,8 @@ def limit_at(
 
     Raises PlanError if the limits are not in order or end before the last of `ticks`.
     """
-    units = _units(period_s)
-    until = [_whole_ticks(limit.until_s, "until_s of a limit", units) for limit in limits]
+    units = units_of(period_s)
+    until = [whole_ticks(limit.until_s, "until_s of a limit", units) for limit in limits]
     if any(later <= earlier for earlier, later in itertools.pairwise(until)):
         raise PlanError("the until_s of the limits do not increase")
     if not until or until[-1] < ticks.max():
@@ -200,6 +217,7 @@ def _solve_speed(plan: ProfilePlan, units: Units) -> float:
 
 def _distance_m(plan: ProfilePlan, units: Units, solved_m_s: float) -> float:
     """Length of the plan; a ramp counts as a step of speed at its centre."""
+    assert plan.duration_s is not None
     ticks = plan.duration_s / units.period_s
     steps = (ramp.change * (ticks - ramp.centre) for ramp in _place(plan, units, solved_m_s))
     return sum(steps) * units.change_m_s * units.period_s
@@ -262,10 +280,11 @@ def _snap(ticks: float) -> float:
 
 
 def _ramp_ticks(time_s: float, number: int, key: str, units: Units) -> int:
-    return _whole_ticks(time_s, f"ramp {number}: {key}", units)
+    return whole_ticks(time_s, f"ramp {number}: {key}", units)
 
 
-def _whole_ticks(time_s: float, name: str, units: Units) -> int:
+def whole_ticks(time_s: float, name: str, units: Units) -> int:
+    """A time in control periods. Raises PlanError if it is not a whole number of them."""
     ticks = round(time_s / units.period_s)
     if abs(time_s / units.period_s - ticks) > 1e-6:
         raise PlanError(f"{name} = {time_s:g} is not a multiple of the period {units.period_s:g} s")
@@ -365,7 +384,7 @@ def _sinusoid(ramp: PlacedRamp, units: Units) -> NDArray[np.int64]:
     few = next(n for n in itertools.count(2) if n**3 * SINUSOID_SPEED_M_S > 0.04 * change_m_s)
     for count in range(few, min(8 * few, ticks // 8)):
         rows = _sinusoid_rows(size, ticks, count)
-        table = evaluate(_segments(rows), units.period_s)
+        table = evaluate(segments_of(rows), units.period_s)
         position_m = np.abs(table.x - x).max() * POSITION_UNIT_M
         speed_m_s = np.abs(table.v - v).max() * units.change_m_s / 2
         if position_m < SINUSOID_POSITION_M and speed_m_s < SINUSOID_SPEED_M_S:
@@ -429,7 +448,7 @@ def _sine(angle: Any) -> Any:
     return total
 
 
-def _segments(rows: NDArray[np.int64]) -> np.ndarray:
+def segments_of(rows: NDArray[np.int64]) -> np.ndarray:
     """Join equal rows to segments."""
     if np.abs(rows).max() > INT32.max:
         raise PlanError("a jerk needs more than 32 bits: the control period is too long")
@@ -445,6 +464,7 @@ def _segments(rows: NDArray[np.int64]) -> np.ndarray:
 
 def _check_ramps(plan: ProfilePlan, ramps: list[PlacedRamp], units: Units) -> None:
     """Order, levels and speeds of the placed ramps."""
+    assert plan.duration_s is not None
     ticks = round(plan.duration_s / units.period_s)
     end_s, speed_m_s = 0.0, 0.0
     for ramp, placed in zip(plan.ramps, ramps, strict=True):
@@ -506,7 +526,8 @@ def _check_profile(plan: ProfilePlan, profile: Profile, units: Units) -> None:
             )
 
 
-def _units(period_s: float) -> Units:
+def units_of(period_s: float) -> Units:
+    """Units of a table at a control period. Raises ValueError for one that it cannot have."""
     _, acceleration_factor = unit_factors(period_s)
     acceleration_m_s2 = acceleration_factor * POSITION_UNIT_M
     return Units(

@@ -39,6 +39,7 @@ from ato_hil.plant_sim.profile import (
     rate_of,
     stretched,
 )
+from ato_hil.plant_sim.running import plan_running, road
 from ato_hil.plant_sim.track import Track, known, sections
 from ato_hil.plant_sim.trains import couplers, lumped, point
 
@@ -385,7 +386,7 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
         raise ScenarioError(f"{_place(path, case)}: key {strange.key}: {strange.text}")
     _check(_place(path, case), scenario)
     try:
-        segments = plan_profile(scenario.profile, scenario.period_s)
+        segments = planned(scenario)
         profile = evaluate(segments, scenario.period_s)
     except (PlanError, ValueError) as error:
         raise ScenarioError(f"{_place(path, case)}: [profile]: {error}") from None
@@ -420,6 +421,15 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
         except ValueError as error:
             raise ScenarioError(f"{_place(path, case)}: [run_length]: {error}") from None
     return loaded
+
+
+def planned(scenario: Scenario) -> np.ndarray:
+    """The reference's table, as the plan states it or as its objective asks."""
+    if scenario.profile.objective is None:
+        return plan_profile(scenario.profile, scenario.period_s)
+    assert isinstance(scenario.train, point.Train)
+    line = road(scenario.track, scenario.atp)
+    return plan_running(scenario.profile, scenario.period_s, scenario.train, line)
 
 
 def at_rate(loaded: Loaded, rate: int) -> Loaded:
@@ -553,6 +563,8 @@ def _check(path: str, scenario: Scenario, under: str = "") -> None:
         raise ScenarioError(f"{path}: key {under}train.model: a line has trains of model 'point'")
     if any(b.from_run <= a.from_run for a, b in pairwise(scenario.changes)):
         raise ScenarioError(f"{path}: key changes: expected from_run to rise")
+    if scenario.profile.objective and not isinstance(scenario.train, point.Train):
+        raise ScenarioError(f"{path}: key {under}profile.objective: expected train model 'point'")
     has_limits = scenario.profile.limits or scenario.profile.limit_above_m_s is not None
     if not has_limits and not scenario.atp.speeds:
         raise ScenarioError(f"{path}: key {under}profile.limits: expected at least one limit")

@@ -3,7 +3,8 @@
     v' = u/M - (c_0 + c_1 v + c_2 v^2) - w(x) + d,   c_q = value_q + swing_q sin(rate t)
 
 w is the track's additional resistance at the front, d the disturbance, |u| <= F_max(v): the command
-of a control period is limited by the speed at its start, braking like traction. v >= 0: at
+of a control period is limited by the speed at its start; the brake may have limits of its own, else
+those of the traction. v >= 0: at
 standstill the train stays until the force exceeds c_0 + w, and it never rolls back.
 
 Integration: midpoint rule, `substeps` a control period; the coefficients are those of the middle of
@@ -65,6 +66,7 @@ class Train(
     mass_kg: float
     resistance: Resistance
     characteristic: Characteristic | None = None  # none: the plant gives what it is asked for
+    brake: Characteristic | None = None  # none: as the traction
     start_m: float = 0.0  # where it stands when a run begins
     # Whether the actuators then hold it against its resistance; else they give no force.
     held_at_start: bool = False
@@ -77,12 +79,19 @@ class Train(
     brake_max_n = ()
     rear_offset_m = 0.0
 
+    @property
+    def braking(self) -> Characteristic | None:
+        """What the brakes can give."""
+        return self.brake or self.characteristic
+
     def __post_init__(self) -> None:
         if self.mass_kg <= 0:
             raise ValueError(f"mass_kg is {self.mass_kg:g}, expected more than 0")
         if self.substeps < 1:
             raise ValueError(f"substeps is {self.substeps}, expected 1 or more")
 
+
+LARGEST = np.dtype([("force_n", np.float64), ("slope_n_s_m", np.float64), ("power_w", np.float64)])
 
 PARAMS = np.dtype(
     [
@@ -92,9 +101,8 @@ PARAMS = np.dtype(
         ("mass_kg", np.float64),
         ("kg_inverse", np.float64),  # 1 / mass
         ("start_m", np.float64),
-        ("force_n", np.float64),  # of the characteristic
-        ("slope_n_s_m", np.float64),
-        ("power_w", np.float64),
+        ("traction", LARGEST),
+        ("brake", LARGEST),
         ("coefficients", np.float64, (3,)),  # m/s^2, 1/s, 1/m
         ("swings", np.float64, (3,)),
         ("rotation", OSCILLATOR),  # of a control period
@@ -130,10 +138,11 @@ def calibrate(train: Train, period_s: float, smeared: bool) -> np.ndarray:
     params["mass_kg"] = train.mass_kg
     params["kg_inverse"] = 1.0 / train.mass_kg
     params["start_m"] = train.start_m
-    known = train.characteristic
-    params["force_n"] = np.inf if known is None else known.force_n
-    params["slope_n_s_m"] = 0.0 if known is None else known.slope_n_s_m
-    params["power_w"] = np.inf if known is None or known.power_w is None else known.power_w
+    for name, known in (("traction", train.characteristic), ("brake", train.braking)):
+        largest = params[name]
+        largest["force_n"] = np.inf if known is None else known.force_n
+        largest["slope_n_s_m"] = 0.0 if known is None else known.slope_n_s_m
+        largest["power_w"] = np.inf if known is None or known.power_w is None else known.power_w
     source = train.resistance
     for q, (value, swing) in enumerate((source.constant, source.linear, source.square)):
         params["coefficients"][0, q] = value
@@ -161,15 +170,22 @@ def reset(params: Any, state: Any) -> None:
 
 
 @step
+def largest_force(known: Any, speed: Any) -> Any:
+    """What a characteristic gives at a speed, N."""
+    most = known.force_n - known.slope_n_s_m * speed
+    if most * speed > known.power_w:
+        most = known.power_w / speed
+    return max(most, 0.0)
+
+
+@step
 def command(params: Any, state: Any) -> None:
     """The total force, as far as the characteristic allows it, into the actuators' channel 0."""
     train = params.train
     speed = state.train.speed_m_s
-    most = train.force_n - train.slope_n_s_m * speed
-    if most * speed > train.power_w:
-        most = train.power_w / speed
-    most = max(most, 0.0)
-    force = min(max(state.node.command_n[0], -most), most)
+    most = largest_force(train.traction, speed)
+    least = -largest_force(train.brake, speed)
+    force = min(max(state.node.command_n[0], least), most)
     command_actuator(params.actuator, state.actuator, int64(0), force)
 
 

@@ -117,9 +117,13 @@ def vehicle(scenario: Scenario) -> Vehicle:
 
 
 def _characteristic(scenario: Scenario) -> Characteristic | None:
-    """What the controller knows of the train's traction: all of it."""
+    """What the controller knows of the train's traction: all of it.
+
+    It takes the brake to be the mirror image; a brake with limits of its own would be held back by
+    those of the traction, so then it knows those of the actuators alone.
+    """
     train = scenario.train
-    if not isinstance(train, point.Train) or train.characteristic is None:
+    if not isinstance(train, point.Train) or train.characteristic is None or train.brake:
         return None
     known = train.characteristic
     return Characteristic(known.force_n, known.slope_n_s_m, known.power_w)
