@@ -22,7 +22,7 @@ ROOMS = (
     {"runs"},
     {"trace"},
     {"session"},
-    {"campaigns", "papers", "export"},
+    {"campaigns", "papers", "export", "lines"},
     {"verify", "reports", "bench"},
     {"cli"},
 )

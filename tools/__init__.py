@@ -4,7 +4,7 @@
 2. `trace`: what is seen of it
 3. `session`: how runs are made
 4. `campaigns`, `papers`, `export`: many runs for one question; each paper's claims, figures,
-   reference; the firmware as C
+   reference; the firmware as C; `lines`: lines and trains of others become scenarios
 5. `verify`, `reports`, `bench`: evidence, pages, rates
 6. `cli`: the command line
 """

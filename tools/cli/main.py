@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli import buses, clean, compare, export, look, prove, run, scenarios
+from ato_hil.tools.cli import buses, clean, compare, export, lines, look, prove, run, scenarios
 from ato_hil.tools.cli.console import EXIT_ENDED_EARLY, end_as_with_ctrl_c, fail
 from ato_hil.tools.cli.options import Viewer
 from ato_hil.tools.cli.output import ignore_other_tools, streams
@@ -33,6 +33,10 @@ COMMANDS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("new", scenarios.new),
         ("doctor", buses.doctor),
         ("clean", clean.clean),
+    ),
+    "Lines": (
+        ("import", lines.import_line),
+        ("plan", lines.plan),
     ),
     "Compare": (
         ("compare", compare.compare),

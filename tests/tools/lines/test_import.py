@@ -1,0 +1,283 @@
+"""Lines and trains of others: readers, the scenario that is made, what is refused."""
+
+import copy
+import json
+import os
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from ato_hil.plant_sim.scenario import load
+from ato_hil.tools.cli.main import app
+from ato_hil.tools.lines import gains, make, plans, tables, ttobench
+from ato_hil.tools.lines.records import Line, LineError, Train
+from ato_hil.tools.runs import onboard
+from ato_hil.tools.session import sil
+
+BENCH = Path(os.environ.get("ATO_HIL_TTOBENCH", "shared/data/ttobench"))
+needs_bench = pytest.mark.skipif(
+    not BENCH.is_dir(), reason="TTOBench is not there: ATO_HIL_TTOBENCH names its folder"
+)
+
+TRACK = {
+    "metadata": {"id": "hill", "library version": "TTOBench v1.5"},
+    "altitude": {"unit": "m", "value": 400},
+    "stops": {"unit": "km", "values": [0, 0.6, 1.4]},
+    "speed limits": {
+        "units": {"position": "m", "velocity": "km/h"},
+        "values": [[0, 72], [400, 54], [700, 90]],
+    },
+    "gradients": {
+        "units": {"position": "m", "slope": "permil"},
+        "values": [[0, 0], [150, 12], [450, -8]],
+    },
+    "curvatures": {
+        "units": {"position": "m", "radius at start": "m", "radius at end": "m"},
+        "values": [[0, "infinity", "infinity"], [200, "infinity", 400], [240, 400, 400]],
+    },
+}
+TRAIN = {
+    "metadata": {"id": "tram"},
+    "mass": {"unit": "t", "value": 100},
+    "rho": {"unit": "%", "value": 10},
+    "length": {"unit": "m", "value": 40},
+    "max traction force": {"unit": "kN", "value": 120},
+    "max traction power": {"unit": "kW", "value": 1000},
+    "max reg braking force": {"unit": "kN", "value": 110},
+    "max speed": {"unit": "km/h", "value": 70},
+    "rolling resistance r0": {"unit": "kN", "value": 1.5},
+    "rolling resistance r1": {"unit": "kN/(km/h)", "value": 0.01},
+    "rolling resistance r2": {"unit": "kN/(km/h)^2", "value": 0.0005},
+}
+JOURNEY = {
+    "metadata": {"id": "j", "associated track": "hill"},
+    "timing points": {
+        "units": {
+            "position": "m", "lower time constraint": "s", "upper time constraint": "s",
+            "lower speed constraint": "km/h", "upper speed constraint": "km/h",
+        },
+        "values": [[0, 0, 0, 0, 0], [300, None, 50, 10, None], [700, 80, 90, 0, 0],
+                   [700, 110, 120, 0, 0], [1400, 190, 200, 0, 0]],
+    },
+}  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name, content in (("track", TRACK), ("train", TRAIN), ("journey", JOURNEY)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+    return tmp_path
+
+
+def test_units_are_read_not_assumed(folder):
+    line = ttobench.read_line(folder / "track.json")
+    assert line.stops_m == [0.0, 600.0, 1400.0]
+    assert line.limits[0] == (0.0, pytest.approx(20.0))
+    assert line.curves[1] == (200.0, 0.0, 1 / 400)
+    train = ttobench.read_train(folder / "train.json")
+    assert (train.mass_kg, train.rotating_share, train.length_m) == (100e3, 0.1, 40.0)
+    assert train.resistance_n_s_m == pytest.approx(36.0)
+    assert train.resistance_n_s2_m2 == pytest.approx(6.48)
+
+
+def test_a_journey_says_where_it_stops_and_how_long_it_runs(folder):
+    line = ttobench.read_line(folder / "track.json")
+    stops, times = ttobench.read_journey(folder / "journey.json", line)
+    assert (stops, times) == ([0.0, 700.0, 1400.0], [80.0, 80.0])
+
+
+def test_curves_are_those_of_roeckl_and_transitions_lie_between():
+    line = Line(
+        name="c", stops_m=[0.0, 300.0], limits=[(0.0, 20.0)], gradients=[(0.0, 5.0)],
+        curves=[(0.0, 0.0, 0.0), (100.0, 0.0, 1 / 250), (140.0, 1 / 250, 1 / 250)],
+    )  # fmt: skip
+    steps = dict(make.resistance_steps(line, 1.0))
+    assert steps[0.0] == 5.0
+    assert steps[140.0] == pytest.approx(5.0 + 1e3 * 0.65 / 250 / (1 - 55 / 250), abs=1e-6)
+    assert 5.0 < steps[100.0] < steps[120.0] < steps[140.0]
+
+
+def _changed(content, path, value):
+    content = copy.deepcopy(content)
+    *way, last = path
+    inner = content
+    for key in way:
+        inner = inner[key]
+    if value is None:
+        del inner[last]
+    else:
+        inner[last] = value
+    return content
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "value", "message"),
+    [
+        ("track", ["stops"], None, "field 'stops': expected an object with its units"),
+        ("track", ["stops", "values"], [0], "'stops': expected two or more positions"),
+        ("track", ["stops", "values"], [0, 2, 1], "'stops': row 3: position 1000 m, expected"),
+        ("track", ["stops", "unit"], "mile", "'stops': unit 'mile', expected one of m, km"),
+        ("track", ["speed limits", "values"], [[0, 0]], "row 1: expected a speed above 0"),
+        ("track", ["speed limits", "values"], [[0, "x"]], "row 1: 'x', expected a number"),
+        ("track", ["speed limits", "values"], [[5, 50]], "the first at position 0"),
+        ("track", ["speed limits", "values"], [[0, 50], [1400, 60]], "less than the length"),
+        ("track", ["gradients", "units"], {"position": "m"}, "units: expected position, slope"),
+        ("track", ["curvatures", "values"], [[0, 0, 5]], "expected no radius of 0"),
+        ("train", ["mass"], None, "missing required field `mass`"),
+        ("train", ["mass", "value"], True, "'mass': True, expected a number"),
+        ("train", ["mass", "value"], -1, "Expected `float` > 0"),
+        ("train", ["mass"], 5, r"'mass': expected \{unit, value\}"),
+        ("journey", ["metadata", "associated track"], "x", "'x', expected 'hill'"),
+        ("journey", ["timing points", "values"], [[0, 0, 0, 0, 0]], "two or more positions"),
+    ],
+)  # fmt: skip
+def test_bad_files_are_one_line(folder, name, path, value, message):
+    content = {"track": TRACK, "train": TRAIN, "journey": JOURNEY}[name]
+    file = folder / f"{name}.json"
+    line = ttobench.read_line(folder / "track.json")
+    file.write_text(json.dumps(_changed(content, path, value)))
+    readers = {
+        "track": ttobench.read_line,
+        "train": ttobench.read_train,
+        "journey": lambda path: ttobench.read_journey(path, line),
+    }
+    with pytest.raises(LineError, match=message) as refused:
+        readers[name](file)
+    assert str(refused.value).startswith(f"{file}: ")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "{", "[" * 100_000])
+def test_what_is_no_json_object_is_one_line(tmp_path, text):
+    file = tmp_path / "x.json"
+    file.write_text(text)
+    with pytest.raises(LineError, match=r"x\.json: (not valid JSON|expected a JSON object)"):
+        ttobench.read_line(file)
+
+
+def test_a_line_as_tables(tmp_path):
+    (tmp_path / "stops.csv").write_text("name;position_m\nA;0\nB;900\n")
+    (tmp_path / "limits.csv").write_text("position_m,speed_km_h\n0,60\n500,40\n\n")
+    (tmp_path / "gradients.csv").write_text("position_m,slope_permille\n0,-3\n")
+    line = tables.read_line(*(tmp_path / f"{n}.csv" for n in ("stops", "limits", "gradients")))
+    assert line.stops_m == [0.0, 900.0]
+    assert line.limits[1] == (500.0, pytest.approx(40 / 3.6))
+    (tmp_path / "limits.csv").write_text("position_m,speed_km_h\n0,60\n500,fast\n")
+    with pytest.raises(LineError, match=r"limits\.csv: line 3: speed_km_h: 'fast', expected"):
+        tables.read_line(tmp_path / "stops.csv", tmp_path / "limits.csv", None)
+    (tmp_path / "limits.csv").write_text("position_m\n0\n")
+    with pytest.raises(LineError, match=r"limits\.csv: line 1: no column speed_km_h"):
+        tables.read_line(tmp_path / "stops.csv", tmp_path / "limits.csv", None)
+    (tmp_path / "train.toml").write_text("mass_kg = 1e5\ntraction_n = 1e5\nmax_speed_m_s = 20\n")
+    with pytest.raises(LineError, match=r"train\.toml: .*missing required field `resistance_n`"):
+        tables.read_train(tmp_path / "train.toml")
+
+
+def _import(folder, *options):
+    out = folder / "made.toml"
+    arguments = ["import", str(folder / "track.json"), "--train", str(folder / "train.json")]
+    return out, CliRunner().invoke(app, [*arguments, "--out", str(out), *options])
+
+
+def test_an_imported_run_is_driven_without_a_fault_by_every_law(folder):
+    out, result = _import(folder, "--times", "62,80", "--law", "cailc")
+    assert result.exit_code == 0, result.output
+    loaded = load(str(out))
+    assert loaded.scenario.law == "cailc"
+    assert list(loaded.scenario.laws) == ["cailc", *(law for law in gains.LAWS if law != "cailc")]
+    assert loaded.scenario.train.mass_kg == pytest.approx(110e3)
+    assert loaded.ticks == 6201
+    for law in gains.LAWS:
+        (node,) = onboard.controllers_for([loaded], law)
+        runs = onboard.run_numbers(law, 2)
+        for (run,) in sil.run_line(loaded, [node], runs=runs, seed=1):
+            assert not run.faults
+            margin = run.truth["permitted_speed_m_s"] - run.truth["speed_m_s"]
+            assert margin.min() > 0
+        assert abs(run.truth["position_m"][-1] - 600.0) < 0.5
+
+
+def test_the_plan_of_an_imported_run_is_printed_and_drawn(folder):
+    out, result = _import(folder, "--journey", str(folder / "journey.json"), "--from", "2")
+    assert result.exit_code == 0, result.output
+    row = plans.section(load(str(out)))
+    assert row.time_s == pytest.approx(80.0)
+    assert row.least_time_s < row.time_s
+    assert row.traction_kwh > 0
+    picture = folder / "plan.svg"
+    result = CliRunner().invoke(app, ["plan", str(out), "--out", str(picture)])
+    assert result.exit_code == 0, result.output
+    assert "700.0" in result.output
+    assert picture.read_bytes().startswith(b"<?xml")
+
+
+def test_without_a_time_the_run_takes_a_tenth_more_than_the_least(folder):
+    out, result = _import(folder)
+    assert result.exit_code == 0, result.output
+    row = plans.section(load(str(out)))
+    assert 1.1 * row.least_time_s <= row.time_s < 1.1 * row.least_time_s + 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--times", "62,x"], "--times: 'x', expected seconds above 0"),
+        (["--times", "62,80,90"], "--times: 3 times, expected up to 2"),
+        (["--times", "62", "--from", "2"], "--times: 1 times, expected one up to stop 3"),
+        (["--from", "3"], "expected two of the stops 1 to 3"),
+        (["--law", "drac"], "law 'drac': expected one of pid-feedforward"),
+        (["--times", "20"], "expected at least"),
+        (["--stops", "x.csv"], "a track takes no --stops"),
+    ],
+)
+def test_a_wrong_option_is_one_line_and_no_file(folder, options, message):
+    out, result = _import(folder, *options)
+    assert result.exit_code == 1
+    assert message in " ".join(result.output.split())
+    assert "Traceback" not in result.output
+    assert not out.exists()
+
+
+def test_a_file_that_is_there_is_not_overwritten(folder):
+    (folder / "made.toml").write_text("mine")
+    out, result = _import(folder, "--times", "62")
+    assert result.exit_code == 1
+    assert "is there already" in result.output
+    assert out.read_text() == "mine"
+
+
+def test_texts_of_others_stay_texts():
+    text = 'a "quote" \\ back'
+    line = Line(name=text, stops_m=[0.0, 500.0], limits=[(0.0, 15.0)])
+    train = Train(mass_kg=5e4, traction_n=5e4, brake_n=5e4, max_speed_m_s=15.0, resistance_n=500.0)
+    made = make.scenario_text(line, train, make.Run(0, 1, 60.0), "cailc", "energy", text)
+    assert made.count(text.replace("\\", "\\\\").replace('"', '\\"')) == 1
+
+
+@needs_bench
+def test_every_file_of_the_benchmark_is_read():
+    lines = [ttobench.read_line(path) for path in sorted((BENCH / "tracks").glob("*.json"))]
+    trains = [ttobench.read_train(path) for path in sorted((BENCH / "trains").glob("*.json"))]
+    assert (len(lines), len(trains)) == (16, 4)
+    (wil,) = (line for line in lines if line.name == "CH_StGallen_Wil")
+    stops, times = ttobench.read_journey(BENCH / "journeys/CH_StGallen_Wil_Journey_01.json", wil)
+    assert (stops, times) == ([0.0, 15000.0, 29556.1], [620.0, 600.0])
+
+
+@needs_bench
+@pytest.mark.long
+@pytest.mark.parametrize("track", sorted((BENCH / "tracks").glob("*.json")), ids=lambda p: p.stem)
+def test_every_train_runs_the_first_section_of_every_track(track, tmp_path):
+    line = ttobench.read_line(track)
+    for path in sorted((BENCH / "trains").glob("*.json")):
+        train = ttobench.read_train(path)
+        duration_s = float(-(-1.1 * make.least_time_s(line, train, 0, 1) // 1))
+        run = make.Run(0, 1, duration_s)
+        out = tmp_path / f"{path.stem}.toml"
+        make.write(out, make.scenario_text(line, train, run, gains.LAWS[0], "energy", "a test"))
+        loaded = load(str(out))
+        for law in gains.LAWS:
+            (node,) = onboard.controllers_for([loaded], law)
+            for (each,) in sil.run_line(loaded, [node], runs=onboard.run_numbers(law, 2), seed=1):
+                assert not each.faults, (path.stem, law)

@@ -1,0 +1,87 @@
+"""A line and a train as data, SI, wherever they come from."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Annotated
+
+import msgspec
+
+from ato_hil.can_dbc.errors import InputError
+
+Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+
+
+class LineError(InputError):
+    """A file of a line or train is wrong; the message names file, field and what was expected."""
+
+
+class Train(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A train; also the keys of a train.toml."""
+
+    name: str = "train"
+    mass_kg: Positive
+    rotating_share: Share = 0.0  # rotating mass, of the mass
+    length_m: NotNegative = 0.0  # 0: not known
+    traction_n: Positive
+    traction_w: Positive | None = None  # none: no limit
+    brake_n: NotNegative = 0.0  # the brake that wins energy back
+    brake_w: Positive | None = None
+    friction_brake_n: NotNegative = 0.0
+    max_acceleration_m_s2: Positive | None = None
+    max_deceleration_m_s2: Positive | None = None
+    max_speed_m_s: Positive
+    resistance_n: NotNegative  # r0 + r1 v + r2 v^2
+    resistance_n_s_m: NotNegative = 0.0
+    resistance_n_s2_m2: NotNegative = 0.0
+    traction_efficiency: Share = 1.0
+    brake_efficiency: Share = 0.0
+
+
+class Tunnel(msgspec.Struct, frozen=True):
+    """A stretch with more air drag."""
+
+    from_m: float
+    length_m: float
+    cross_section_m2: float
+
+
+class Line(msgspec.Struct, frozen=True, kw_only=True):
+    """A line; each list of steps is [from, value], the first from 0."""
+
+    name: str
+    stops_m: list[float]
+    limits: list[tuple[float, float]]  # m/s
+    gradients: list[tuple[float, float]] = []  # per mille, positive is uphill
+    curves: list[tuple[float, float, float]] = []  # from, 1/m at its start and at its end
+    tunnels: list[Tunnel] = []
+    altitude_m: float = 0.0
+
+
+def check_stops(where: str, stops: list[float]) -> None:
+    """Raises LineError unless there are two or more, the first at 0, rising."""
+    if len(stops) < 2 or stops[0] != 0.0:
+        raise LineError(f"{where}: expected two or more positions, the first 0")
+    check_rising(where, stops)
+
+
+def check_steps(where: str, positions: list[float], length_m: float) -> None:
+    """Raises LineError unless the positions begin at 0, rise and stay below the length."""
+    if not positions or positions[0] != 0.0:
+        raise LineError(f"{where}: expected one or more rows, the first at position 0")
+    check_rising(where, positions)
+    if positions[-1] >= length_m:
+        raise LineError(
+            f"{where}: position {positions[-1]:g} m, expected less than the length, {length_m:g} m"
+        )
+
+
+def check_rising(where: str, positions: list[float]) -> None:
+    """Raises LineError at the first position that is not above the one before it."""
+    for row, (before, after) in enumerate(pairwise(positions), 2):
+        if not after > before:
+            raise LineError(
+                f"{where}: row {row}: position {after:g} m, expected above {before:g} m"
+            )
