@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ato_hil.plant_sim import atp, optimum
+from ato_hil.plant_sim.atp_tables import static_speeds
 from ato_hil.plant_sim.optimum import BOUNDS, Infeasible, Mesh
 from ato_hil.plant_sim.planner import (
     DISTANCE_TOLERANCE_M,
@@ -52,7 +53,7 @@ class Road:
 
 def road(track: Track, supervision: atp.Atp) -> Road:
     """Gradients and static limits, those for front and rear."""
-    way = atp.static_speeds(supervision)
+    way = static_speeds(supervision)
     return Road(sections(track), np.asarray(way.from_m), np.asarray(way.values))
 
 

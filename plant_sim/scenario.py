@@ -410,10 +410,11 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
             except ValueError as error:
                 since = f" (from run {change})" if change else ""
                 raise ScenarioError(f"{place}: key {error}{since}") from None
-    if scenario.metrics.from_s >= scenario.profile.duration_s:
+    duration_s = (loaded.ticks - 1) * scenario.period_s
+    if scenario.metrics.from_s >= duration_s:
         raise ScenarioError(
             f"{place}: key metrics.from: {scenario.metrics.from_s:g}, expected less than"
-            f" profile.duration_s, {scenario.profile.duration_s:g}"
+            f" the duration of the profile, {duration_s:g}"
         )
     if scenario.run_length and scenario.run_length.reading == "stretched":
         try:
