@@ -414,7 +414,7 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
     if scenario.metrics.from_s >= duration_s:
         raise ScenarioError(
             f"{place}: key metrics.from: {scenario.metrics.from_s:g}, expected less than"
-            f" the duration of the profile, {duration_s:g}"
+            f" profile.duration_s, {duration_s:g}"
         )
     if scenario.run_length and scenario.run_length.reading == "stretched":
         try:
