@@ -25,6 +25,7 @@ from pickle import loads
 from typing import Any
 
 import numba
+from numba.core import sigutils
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
@@ -189,7 +190,12 @@ class _StepCache(_Cache):
         if path is None:
             return None
         data = cache_files.load(path, key)
-        return None if data is None else CompileResult._rebuild(target_context, *loads(data))
+        if data is None:
+            return None
+        found = CompileResult._rebuild(target_context, *loads(data))
+        # Types that print alike may differ: a tuple class made at run time may be another one now.
+        arguments, _result = sigutils.normalize_signature(signature)
+        return found if found.signature.args == arguments else None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         path, key = self._place(signature, compiled.codegen)

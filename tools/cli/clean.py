@@ -22,7 +22,7 @@ def clean(
 
     with one_line_for_bad_input():
         compiled = cache.root()  # of ours alone, also where NUMBA_CACHE_DIR names the place
-        if compiled is not None:
+        if compiled is not None and any(compiled.iterdir()):
             _remove(compiled)
         folders = sorted(places.RUNS.iterdir()) if runs and places.RUNS.is_dir() else []
         for folder in folders:

@@ -26,10 +26,11 @@ def say(text: str, style: str = "") -> None:
 
 def say_if_compiling() -> None:
     """The first run compiles, and nothing is to be seen of that for a while."""
+    from ato_hil.can_dbc.cache import SUFFIX
     from ato_hil.can_dbc.step import INTERPRETED, cache_directory
 
     folder = cache_directory()
-    if not INTERPRETED and (folder is None or not folder.is_dir()):
+    if not INTERPRETED and (folder is None or not any(folder.glob(f"*{SUFFIX}"))):
         say("the steps are compiled now, once: about half a minute", "dim")
 
 

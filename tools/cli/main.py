@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from ato_hil.tools.cli import buses, clean, compare, export, lines, look, prove, run, scenarios
-from ato_hil.tools.cli.console import EXIT_ENDED_EARLY, end_as_with_ctrl_c, fail
+from ato_hil.tools.cli.console import EXIT_ENDED_EARLY, end_as_with_ctrl_c, fail, say
 from ato_hil.tools.cli.options import Viewer
 from ato_hil.tools.cli.output import ignore_other_tools, streams
 from ato_hil.tools.runs.limits import limit
@@ -70,7 +70,7 @@ app.add_typer(export.app, name="export", rich_help_panel="Take away")
 
 def _version(asked: bool) -> None:
     if asked:
-        typer.echo(f"ato-hil {importlib.metadata.version('ato-hil')}")
+        say(f"ato-hil {importlib.metadata.version('ato-hil')}")
         raise typer.Exit
 
 

@@ -11,9 +11,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from rich.cells import cell_len
-from rich.console import Console, JustifyMethod
+from rich.console import JustifyMethod
 from rich.table import Table
 from rich.text import Text
+
+from ato_hil.tools.cli.output import PlainConsole
 
 LONGEST_WORD = 24  # of a text that is kept whole; longer ones, such as paths, are folded
 GAP = 2  # between columns
@@ -34,12 +36,14 @@ class Row(NamedTuple):
     style: str = ""
 
 
-def show(console: Console, columns: Sequence[Column], rows: Sequence[Row], title: str = "") -> None:
+def show(
+    console: PlainConsole, columns: Sequence[Column], rows: Sequence[Row], title: str = ""
+) -> None:
     """Prints a table. What is in it is shown as it is: it may come from a user's file."""
     room = console.width
     if not console.is_terminal:  # a file or a pipe has no width
         room = max(room, _needed(columns, rows))
-        console = Console(file=console.file, width=room, highlight=False)
+        console = PlainConsole(file=console.file, width=room)
     if title:
         console.print(Text(title, style="italic"), soft_wrap=True)
     if not _fits(columns, rows, room):
@@ -100,7 +104,9 @@ def _upright(columns: Sequence[Column], rows: Sequence[Row], room: int) -> Table
     return table
 
 
-def _turned(console: Console, columns: Sequence[Column], rows: Sequence[Row], room: int) -> None:
+def _turned(
+    console: PlainConsole, columns: Sequence[Column], rows: Sequence[Row], room: int
+) -> None:
     names = [" ".join(column.heading.split()) for column in columns]
     label = min(max(map(cell_len, names), default=0), room // 2 - GAP)
     left = room - label - GAP

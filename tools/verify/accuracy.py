@@ -79,7 +79,7 @@ def check(law: str) -> Iterator[Row]:
             "accuracy",
             law,
             "fixed point against float64",
-            "no float64 form in REFERENCES of a paper",
+            "no float64 reference in a paper",
             FAILED,
         )
         return

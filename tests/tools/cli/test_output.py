@@ -26,7 +26,7 @@ from ato_hil.tools.cli.output import (
 from ato_hil.tools.papers import style
 from ato_hil.tools.runs import pictures
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 PRINTABLE = st.text(st.characters(exclude_categories=["C", "Z"], exclude_characters="\u3164"))
 TRICKY = st.sampled_from(["[/h]", "[m/s]", "[red]", ":smile:", ":ABC:", "\\[", "[/]", "$x$"])
 
@@ -67,7 +67,7 @@ def test_there_is_one_way_to_print() -> None:
     """What would read a user's text as markup, or fail where the output does."""
     other_ways = re.compile(r"rich\.(markup|prompt|pretty)|import Console\b|typer\.(secho|echo)")
     for path in sorted((ROOT / "tools").rglob("*.py")):
-        if path.name != "console.py":
+        if path.name != "output.py":
             assert not other_ways.search(path.read_text(encoding="utf-8")), path
 
 
@@ -123,7 +123,7 @@ def test_no_output_ends_a_command_in_a_traceback(
     done = subprocess.run(
         ["bash", "-c", command],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": str(ROOT / "src")},
         capture_output=True,
         timeout=100,
         check=False,

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from ato_hil.can_dbc import step
 from ato_hil.plant_sim.scenario import load
 from ato_hil.tools.cli import console, expect, run
 from ato_hil.tools.cli.expect import ExpectError, parse, unmet
@@ -77,8 +78,10 @@ def test_the_first_compilation_is_announced(
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     console.say_if_compiling()
     assert "the steps are compiled now" in screen.getvalue()
-    (tmp_path / "x").mkdir()
-    (tmp_path / "x" / "step.nbi").touch()
+    folder = step.cache_directory()
+    assert folder is not None
+    folder.mkdir(parents=True)
+    (folder / "compiled.nbc").touch()
     console.say_if_compiling()
     assert screen.getvalue().count("\n") == 1
 
@@ -104,11 +107,11 @@ def test_clean_takes_what_can_be_made_again(ato_hil, tmp_path: Path) -> None:
     here = {"cwd": tmp_path, "XDG_CACHE_HOME": str(cache), "NUMBA_CACHE_DIR": ""}
     done = ato_hil("clean", **here)
     assert done.returncode == 0, done.stderr
-    assert not (cache / "ato-hil").exists()
+    assert not (cache / "ato-hil" / "old").exists()
     assert (tmp_path / "runs" / "session").exists()
     done = ato_hil("clean", "--runs", **here)
     assert done.stdout == "removed runs/session   0.0 MB\n"
     assert (tmp_path / "runs" / "mine" / "notes.txt").exists()
     assert (cache / "others").exists()
     done = ato_hil("clean", cwd=tmp_path, NUMBA_CACHE_DIR=str(cache))
-    assert "left alone" in done.stdout
+    assert (cache / "others").exists()

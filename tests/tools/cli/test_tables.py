@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
-from rich.console import Console
 
 from ato_hil.plant_sim.scenario import load
 from ato_hil.tools.cli import buses, columns, run
 from ato_hil.tools.cli.options import Mode
+from ato_hil.tools.cli.output import PlainConsole
 from ato_hil.tools.cli.tables import Column, Row, show
 from ato_hil.tools.reports.bus_report import Report
 from ato_hil.tools.reports.bus_report import report as bus_report
@@ -21,11 +21,11 @@ from ato_hil.tools.reports.bus_report import report as bus_report
 WIDTHS = (40, 80, 120)
 
 
-def screen(width: int) -> Console:
-    return Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
+def screen(width: int) -> PlainConsole:
+    return PlainConsole(width=width, force_terminal=True, color_system=None, file=io.StringIO())
 
 
-def shown(console: Console, width: int) -> str:
+def shown(console: PlainConsole, width: int) -> str:
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert max(map(cell_len, text.splitlines())) <= width
     assert "…" not in text
@@ -131,7 +131,7 @@ def test_what_comes_from_a_user_is_no_markup() -> None:
 
 
 def test_a_pipe_gets_every_column() -> None:
-    console = Console(width=150, file=io.StringIO())
+    console = PlainConsole(width=150, file=io.StringIO())
     columns_ = [Column(f"c{number}", spare=True) for number in range(40)]
     show(console, columns_, [Row(tuple("123456" for _ in columns_))])
     assert len(console.file.getvalue().splitlines()) == 2  # type: ignore[attr-defined]

@@ -167,13 +167,15 @@ def test_a_base_is_a_file_of_the_current_folder(tmp_path: Path, monkeypatch) -> 
 
 
 def test_overflow_in_the_interpreter_is_one_line(tmp_path: Path) -> None:
-    law = tmp_path / "pid.py"
+    law = tmp_path / "overflowing.py"
     shipped = Path(session.__file__).parents[2] / "controller" / "laws" / "pid.py"
     text = shipped.read_text()
-    assert "outputs.force = " in text
-    law.write_text(text.replace("outputs.force = ", "outputs.force = (int64(1) << 62) * 4 + ", 1))
+    assert "change = " in text
+    text = text.replace("change = ", "change = (int64(1) << 62) * 4 * 0 + ", 1)
+    law.write_text(text.replace("def pid(", "def overflowing("))
+    scenario = {**SHORT, "laws": {"overflowing": {"gp": 3e5, "gI": 1.0, "gD": 10.0}}}
     with pytest.raises(ato_hil.RunError, match=r"^the interpreter process ended .*OverflowError"):
-        ato_hil.simulate(SHORT, law=law, mode="mil", out=tmp_path / "out").complete()
+        ato_hil.simulate(scenario, law=law, mode="mil", out=tmp_path / "out").complete()
 
 
 def test_the_import_is_cheap() -> None:

@@ -105,7 +105,8 @@ def test_the_viewer_sends_no_usage_data(settings: Path) -> None:
 
 
 def test_no_folder_for_settings_is_one_line(settings: Path) -> None:
-    settings.write_text("a file is in the way")
+    (settings / "ato-hil").mkdir(parents=True)
+    (settings / "ato-hil" / "viewer").write_text("a file is in the way")
     with pytest.raises(ViewerError, match=r"cache/ato-hil/viewer: settings of the viewer"):
         live_viewer.environment()
 
