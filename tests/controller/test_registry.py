@@ -70,7 +70,10 @@ def test_files_of_one_name_are_two_laws(tmp_path):
         ("import no_such_module\n", "{file}:1: ModuleNotFoundError: No module named"),
         (LAW.replace("STATE", "STORE"), "{file}: expected STATE, see the laws in"),
         (LAW.replace("calibrate", "set_up"), "{file}: expected calibrate, see the laws in"),
-        (LAW.replace("WORDS = ", "") + "WORDS = (('u', 'N', 4),)", "{file}:12: declaration: WORDS without a function learned"),
+        (
+            LAW.replace("WORDS = ", "") + "WORDS = (('u', 'N', 4),)",
+            "{file}:12: declaration: WORDS without a function learned",
+        ),
         (LAW.replace("mine", "yours"), "{file}: expected mine, see the laws in"),
     ],
 )

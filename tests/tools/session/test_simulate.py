@@ -144,7 +144,7 @@ def test_nothing_is_left_without_a_folder(tmp_path: Path, monkeypatch) -> None:
         ({"runs": 0}, r"^runs is 0, expected a whole number from 1 on"),
         ({"runs": 2.5}, r"^runs is 2.5, expected a whole number from 1 on"),
         ({"seed": -1}, r"^seed is -1, expected a whole number from 0 on"),
-        ({"mode": "pil"}, r"^mode is 'pil', expected one of hil, sil, mil"),
+        ({"mode": "oil"}, r"^mode is 'oil', expected one of hil, sil, mil"),
         ({"faults": {"bus": [{"kind": "vanish"}]}}, r"^the faults given: "),
         ({"faults": "none.toml"}, r"none.toml"),
         ({"mode": "mil", "faults": DROPS}, r"^the faults given: faults need mode sil or hil"),
