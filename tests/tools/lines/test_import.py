@@ -191,11 +191,11 @@ def test_an_imported_run_is_driven_without_a_fault_by_every_law(folder):
     for law in gains.LAWS:
         (node,) = onboard.controllers_for([loaded], law)
         runs = onboard.run_numbers(law, 2)
-        for (run,) in sil.run_line(loaded, [node], runs=runs, seed=1):
-            assert not run.faults
-            margin = run.truth["permitted_speed_m_s"] - run.truth["speed_m_s"]
-            assert margin.min() > 0
-        assert abs(run.truth["position_m"][-1] - 600.0) < 0.5
+        for run in sil.run_line(loaded, [node], runs=runs, seed=1):
+            assert run.faults == [[]]
+            (truth,) = run.truths
+            assert (truth["permitted_speed_m_s"] - truth["speed_m_s"]).min() > 0
+        assert abs(truth["position_m"][-1] - 600.0) < 0.5
 
 
 def test_the_plan_of_an_imported_run_is_printed_and_drawn(folder):
@@ -279,5 +279,5 @@ def test_every_train_runs_the_first_section_of_every_track(track, tmp_path):
         loaded = load(str(out))
         for law in gains.LAWS:
             (node,) = onboard.controllers_for([loaded], law)
-            for (each,) in sil.run_line(loaded, [node], runs=onboard.run_numbers(law, 2), seed=1):
-                assert not each.faults, (path.stem, law)
+            for each in sil.run_line(loaded, [node], runs=onboard.run_numbers(law, 2), seed=1):
+                assert each.faults == [[]], (path.stem, law)
