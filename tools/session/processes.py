@@ -399,13 +399,15 @@ def run(
             got = bench.next_event(0.5)
             if got is not None:
                 waiting = _strike(bench, waiting, got[1], faults)
+                if got[0] is leader and got[1]["event"] == "run":
+                    recorder.command(command="over", run=got[1]["run"])
                 yield (*got, bench)
             elif not external and bench.now_s() - leader.heard_s > SILENCE_S:
                 raise RunError(f"the {leader.name} process hangs: no word for {SILENCE_S:g} s")
             if "done" in leader.said:
                 leader.heard_s = bench.now_s()  # it has no more to say
                 deadline = deadline or bench.now_s() + ACCOUNT_TIMEOUT_S
-                if bench.now_s() > deadline:  # it may have lost just the frame that says so
+                if bench.now_s() > deadline:
                     run = last_run(leader)
                     late = [node.name for node in bench.accountants if run not in node.runs]
                     raise RunError(f"the {', '.join(late)} has not seen the end of run {run}")

@@ -18,6 +18,9 @@ It says on stdout, in JSON lines:
 and takes on stdin, where a file is deleted when it has been read:
 
     {"command": "facts", "file": "facts_1.npz"}            of a run, for the trace: trace/facts.py
+    {"command": "over", "run": 1}                          its leader has ended it: what is still
+                                                           missing when the bus is quiet, or in a
+                                                           later run, was lost
     {"command": "stop"}                                    ends the recording, as SIGTERM, SIGINT
                                                            and the end of stdin do
 
@@ -77,6 +80,7 @@ PAUSE_S = 0.005
 IDLE_S = 0.05  # longest wait for a frame, so that commands are heard
 SILENCE_S = 0.01  # at the end: the bus has nothing more
 DRAIN_S = 1.0  # at the end: longest wait for that
+QUIET_S = 2.0  # without a frame: whatever the bus still held for this node has come
 FIRST_ROWS = 1 << 14
 
 
@@ -152,6 +156,7 @@ class Recorder:
         self._logged_tick = 0
         self._dropped = 0  # frames that the bus had dropped when the last run ended
         self._foreign = 0  # frames of other kinds since then
+        self._told = 0  # the last run whose end was told
 
     @property
     def frames(self) -> np.ndarray:
@@ -180,7 +185,24 @@ class Recorder:
         if self.run is not None:
             self._append(frame_ids[start:], words[start:])
             if self.tick >= self._logged_tick + BATCH_TICKS:
-                self._log(int(np.searchsorted(self.frames["tick"], self.tick)))
+                self._log(self.run, int(np.searchsorted(self.frames["tick"], self.tick)))
+
+    def over(self, run: int, quiet: bool, dropped: int = 0) -> bool:
+        """Take the word of its leader that a run is over, as its end may have been lost; whether
+        it has been told now or before.
+
+        :param quiet: nothing more comes from the bus.
+        :param dropped: as in `take`.
+        """
+        if run <= self._told:
+            return True
+        if not quiet and (self.run is None or self.run <= run):
+            return False
+        if self.run is not None and self.run <= run:
+            self._end_run(False, dropped)
+        if run > self._told:  # not a frame of it came
+            self._close(run, 0, self._rows[:0], False, dropped)
+        return True
 
     def finish(self, dropped: int = 0) -> None:
         """End a run that was cut short; `dropped` as in `take`. The leader's also ends the trace,
@@ -213,17 +235,22 @@ class Recorder:
             rows["tick"] = self.tick + ticks_of(frame_ids)
             self.tick += int(np.count_nonzero(frame_ids == FORCE_CMD.frame_id))
 
-    def _log(self, end: int) -> None:
-        """Bring the trace up to row `end`."""
-        if self._trace is not None and self.run is not None:
-            self._trace.frames(self.run, self._rows[self._logged : end], self._train)
+    def _log(self, number: int, end: int) -> None:
+        """Bring the trace of a run up to row `end`."""
+        if self._trace is not None:
+            self._trace.frames(number, self._rows[self._logged : end], self._train)
         self._logged = end
         self._logged_tick = self.tick
 
     def _end_run(self, complete: bool, dropped: int) -> None:
-        frames, number = self.frames, self.run
+        number, self.run = self.run, None
         assert number is not None
-        self._log(self._count)
+        self._log(number, self._count)
+        self._close(number, self.tick, self.frames, complete, dropped)
+
+    def _close(
+        self, number: int, ticks: int, frames: np.ndarray, complete: bool, dropped: int
+    ) -> None:
         self._digest.update(frames)
         if self._keep_frames is not None:
             np.save(self._keep_frames / f"frames_{number}.npy", frames)
@@ -232,18 +259,18 @@ class Recorder:
         if self._trace is not None:
             if lost or dropped_now:
                 text = f"recorder lost frames: {lost}, the bus dropped {dropped_now}"
-                self._trace.text(number, self.tick, text, "WARN", self._train)
+                self._trace.text(number, ticks, text, "WARN", self._train)
             if self._faults is not None:
                 train = self._train + 1
                 here = [e for e in injected(self._faults) if (e.run, e.train) == (number, train)]
                 facts.apply(facts.Facts(number, injected=here), self._trace)
             if not complete:
-                text = f"cut short at tick {self.tick}"
-                self._trace.text(number, self.tick, text, "WARN", self._train)
+                text = f"cut short at tick {ticks}"
+                self._trace.text(number, ticks, text, "WARN", self._train)
         self._ended(
             {
                 "run": number,
-                "ticks": self.tick,
+                "ticks": ticks,
                 "frames": len(frames),
                 "lost": lost,
                 "dropped": dropped_now,
@@ -252,7 +279,7 @@ class Recorder:
                 "complete": complete,
             }
         )
-        self.run = None
+        self._told = number
         self._dropped, self._foreign = dropped, 0
 
 
@@ -288,19 +315,28 @@ def record(
     Raises can.CanError if a bus is gone.
     """
     ended = False
+    over: list[int] = []
+    heard_s = time.monotonic()
     while not (ended or stop.requested):
         heard = listen(taps, IDLE_S)
         while not commands.empty():
             command = commands.get()
             if command["command"] == "stop":
                 ended = True
+            elif command["command"] == "over":
+                over.append(command["run"])
+                heard_s = time.monotonic()
             else:
                 file = Path(command["file"])
                 if trace is not None:
                     facts.apply(facts.load(file), trace)
                 file.unlink()
         if heard:
+            heard_s = time.monotonic()
             time.sleep(PAUSE_S * len(taps))
+        quiet = time.monotonic() - heard_s > QUIET_S
+        while over and all([tap.over(over[0], quiet, dropped_frames(bus)) for bus, tap in taps]):
+            over.pop(0)
     deadline = time.monotonic() + DRAIN_S
     while listen(taps, SILENCE_S) and time.monotonic() < deadline:
         pass

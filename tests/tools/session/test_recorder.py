@@ -576,6 +576,25 @@ def test_a_command_that_fails_ends_the_recorder_with_its_trace(
     RrdReader(str(tmp_path / "trace.rrd")).store()
 
 
+def test_a_run_whose_end_was_lost_is_over_when_its_leader_says_so(events, tmp_path: Path) -> None:
+    """Not before the bus is quiet or carries a later run: its frames may be on their way."""
+    nodes = Nodes()
+    recorder = Recorder(keep_frames=tmp_path)
+    recorder.take(nodes.run(1, 20))
+    assert not recorder.over(1, quiet=False)
+    assert recorder.over(1, quiet=True, dropped=7)
+    recorder.take(nodes.run(4, 20))  # runs 2 and 3 were lost whole
+    assert [recorder.over(run, quiet=False) for run in (2, 3, 4)] == [True, True, False]
+    recorder.take([nodes.control(ENDED, 4)])
+    assert recorder.over(4, quiet=False)
+    told = [(event["run"], event["ticks"], event["complete"]) for event in events]
+    assert told == [(1, 20, False), (2, 0, False), (3, 0, False), (4, 20, True)]
+    assert [len(np.load(tmp_path / f"frames_{run}.npy")) > 0 for run in (1, 2, 3, 4)] == [
+        *(True, False, False, True)
+    ]
+    assert events[0]["dropped"] == 7
+
+
 def test_a_run_of_a_line_has_ended_when_it_has_on_every_bus(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

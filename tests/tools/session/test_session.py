@@ -20,6 +20,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from ato_hil.can_dbc import rendezvous
+from ato_hil.can_dbc.hub_server import QUEUE_FRAMES
 from ato_hil.tools.cli.options import Mode
 from ato_hil.tools.cli.run import Screen
 from ato_hil.tools.session import over_bus
@@ -397,7 +398,12 @@ class HoldsRecorder(Screen):
             Timer(1.5, os.kill, (recorder, signal.SIGCONT)).start()
 
 
-def test_a_recorder_that_falls_runs_behind_costs_no_row(short: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("queue_frames", [QUEUE_FRAMES, 2000])
+def test_a_recorder_that_falls_runs_behind_costs_no_row(
+    short: Path, tmp_path: Path, hub_with, queue_frames: int
+) -> None:
+    """Not even where the hub drops the frames that end a run, and those of whole runs."""
+    hub_with(QUEUE_FRAMES=queue_frames)
     listener = HoldsRecorder()
     options = Options(str(short), None, 12, "hil", channel(tmp_path), 1, tmp_path / "out", None)
     rows = run(options, listener)["runs"]
