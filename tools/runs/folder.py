@@ -30,6 +30,10 @@ USED = re.compile(
     r"(?:/train_(?P<train>\d+))?"
 )
 FRAMES = "bus/frames"
+# Entities of the plant's true state: what shares the first, and speeds that supervise the train.
+# Their lines are named as the columns.
+STATE, LIMITS = "state", "limits"
+OF_FIELDS = (f"truth/{STATE}", f"truth/{LIMITS}")
 
 
 class FolderError(InputError):
@@ -41,7 +45,8 @@ class Missing(Exception):
 
 
 class Series(NamedTuple):
-    """Columns of one entity of a trace, ordered by time."""
+    """Columns of one entity of a trace, ordered by time: of the truth a row a tick, of the bus
+    without the rows that lie on the straight line between their neighbours."""
 
     time_s: np.ndarray  # (n,)
     values: np.ndarray  # (n, lines)
@@ -214,38 +219,62 @@ class Folder:
         parts: defaultdict[tuple[str, int, int], list[tuple[np.ndarray, np.ndarray]]] = defaultdict(
             list
         )
+        names: dict[tuple[str, int, int], list[str]] = {}  # of the lines
         try:
             for chunk in RrdReader(str(self.trace_file)).stream():
                 found = USED.fullmatch(str(chunk.entity_path))
-                if found is None or chunk.is_static:
+                if found is None:
                     continue
-                train = int(found["train"] or 1) - 1
-                parts[found["name"], int(found["run"]), train].append(
-                    _columns(chunk.to_record_batch())
-                )
+                key = (found["name"], int(found["run"]), int(found["train"] or 1) - 1)
+                batch = chunk.to_record_batch()
+                if chunk.is_static:
+                    names[key] = batch.column("SeriesLines:names").to_pylist()[0]
+                else:
+                    parts[key].append(_columns(batch, self.scenario.period_s))
         except (RuntimeError, ValueError, OSError) as error:
             text = " ".join(str(error).split())
             raise FolderError(f"{self.trace_file}: not a trace of ato-hil: {text}") from None
-        return {key: _joined(of_key, self.scenario.period_s) for key, of_key in parts.items()}
+        series: dict[tuple[str, int, int], Series] = {}
+        for (entity, run, train), of_key in parts.items():
+            table = _joined(of_key)
+            if entity.startswith("truth/"):
+                table = _each_tick(table, self.scenario.period_s)
+            if entity not in OF_FIELDS:
+                series[entity, run, train] = table
+                continue
+            for name, column in zip(names[entity, run, train], table.values.T, strict=True):
+                series[f"truth/{name}", run, train] = Series(table.time_s, column[:, None])
+        return series
 
 
-def _columns(batch: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Ticks, and a row of values for each; of frames a row for each of the frames of a tick."""
-    ticks = np.asarray(batch.column("tick"))
+def _each_tick(table: Series, period_s: float) -> Series:
+    """With the rows that were left out. What is equal on both sides of them comes back exactly."""
+    at = np.rint(table.time_s / period_s)
+    ticks = np.arange(at[0], at[-1] + 1)
+    columns = [np.interp(ticks, at, column) for column in table.values.T]
+    return Series(ticks * period_s, np.column_stack(columns))
+
+
+def _columns(batch: Any, period_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times, and a row of values for each; of frames a row for each of the frames of a tick."""
+    ticks = np.rint(np.asarray(batch.column("time")).astype(np.int64) / (1e9 * period_s))
     names = batch.schema.names
     if "Scalars:scalars" in names:
         values = batch.column("Scalars:scalars")
-        return ticks, np.asarray(values.flatten()).reshape(len(values), -1)
+        return ticks * period_s, np.asarray(values.flatten()).reshape(len(values), -1)
     parts = [batch.column(f"ato_hil.Frames:{name}") for name in ("frame_id", "payload")]
     counts = np.asarray(parts[0].value_lengths())
-    return np.repeat(ticks, counts), np.column_stack([np.asarray(p.flatten()) for p in parts])
+    return (
+        np.repeat(ticks, counts) * period_s,
+        np.column_stack([np.asarray(p.flatten()) for p in parts]),
+    )
 
 
-def _joined(parts: list[tuple[np.ndarray, np.ndarray]], period_s: float) -> Series:
-    ticks = np.concatenate([part[0] for part in parts])
+def _joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> Series:
+    times = np.concatenate([part[0] for part in parts])
     values = np.concatenate([part[1] for part in parts])
-    order = np.argsort(ticks, kind="stable")
-    return Series(ticks[order] * period_s, values[order])
+    order = np.argsort(times, kind="stable")
+    return Series(times[order], values[order])
 
 
 def read(path: str | Path) -> Folder:

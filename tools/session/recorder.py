@@ -335,7 +335,10 @@ def record(
             heard_s = time.monotonic()
             time.sleep(PAUSE_S * len(taps))
         quiet = time.monotonic() - heard_s > QUIET_S
-        while over and all([tap.over(over[0], quiet, dropped_frames(bus)) for bus, tap in taps]):
+        while over:
+            told = [tap.over(over[0], quiet, dropped_frames(bus)) for bus, tap in taps]
+            if not all(told):
+                break
             over.pop(0)
     deadline = time.monotonic() + DRAIN_S
     while listen(taps, SILENCE_S) and time.monotonic() < deadline:

@@ -7,13 +7,15 @@ to the last.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ato_hil.can_dbc.codec import MESSAGES
 from ato_hil.tools.runs import units
+from ato_hil.tools.runs.folder import LIMITS, STATE
 from ato_hil.tools.trace.charts import room
+from ato_hil.tools.trace.plots import PLOTS, SUPERVISION
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -31,8 +33,6 @@ BARS = (
 RUNS = "violet is the first run, yellow the last"
 TRAINS = "violet is the leading train, yellow the last"
 
-# Endings of names of quantities, longest first, and their units.
-
 
 @dataclass(frozen=True)
 class Layout:
@@ -45,7 +45,7 @@ class Layout:
     trains: int
     own_timetable: bool  # the run shown has a reference of its own
     length_m: float  # of the reference
-    curves: tuple[str, ...] = ()  # true columns of speeds that supervise the train
+    fields: tuple[str, ...] = ()  # of the plant's true state
     words: tuple[str, ...] = ()  # of the learning memory, as `charts` names them
     timing: bool = False
 
@@ -112,13 +112,26 @@ def whole(root: rrb.Container) -> rrb.Blueprint:
     )
 
 
-def plot(name: str, *entities: str, legend: bool = True) -> rrb.TimeSeriesView:
-    """A plot over all of the time."""
+def plot(
+    name: str,
+    *entities: str,
+    legend: bool = True,
+    shown: Mapping[str, Sequence[bool]] | None = None,
+) -> rrb.TimeSeriesView:
+    """A plot over all of the time.
+
+    :param shown: which of its lines, of an entity that has others besides.
+    """
+    import rerun as rr
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
         name=name,
         contents=[f"/{entity}" for entity in entities],
+        overrides={
+            f"/{entity}": rr.SeriesLines(visible_series=lines)
+            for entity, lines in (shown or {}).items()
+        },
         axis_x=_all_time(),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
     )
@@ -197,10 +210,13 @@ def _overview(layout: Layout) -> rrb.Container:
         rrb.Vertical(
             plot(
                 "Speed: measured blue, reference orange, permitted red, target pink [m/s]",
-                f"bus/speed/{current}",
+                f"bus/motion/{current}",
                 f"reference/speed_m_s{reference}",
-                *(f"truth/{field}/{current}" for field in layout.curves),
+                f"truth/{LIMITS}/{current}",
                 legend=False,
+                # The permitted speed is on the bus already.
+                shown=_motion(layout, "Speed", "TargetSpeed", "PermittedSpeed")
+                | _true(layout, LIMITS, *list(SUPERVISION)[1:]),
             ),
             chart(
                 "Speed over position: true green, reference orange, permitted red [m/s, m]",
@@ -217,6 +233,22 @@ def _overview(layout: Layout) -> rrb.Container:
         ),
         name="Overview",
     )
+
+
+def _motion(layout: Layout, *signals: str) -> dict[str, list[bool]]:
+    """Which lines of the measured motion are shown."""
+    (motion,) = (each for each in PLOTS if each.name == "motion")
+    lines = [line.signal in signals for line in motion.lines]
+    return {f"bus/{motion.name}/{layout.current}": lines}
+
+
+def _true(
+    layout: Layout, entity: str, *fields: str, train: int | None = None
+) -> dict[str, list[bool]]:
+    """Which lines of the true state are shown, of the current train or that of a line."""
+    there = [field for field in layout.fields if (field in SUPERVISION) == (entity == LIMITS)]
+    place = layout.current if train is None else f"{layout.run}/train_{train + 1:02d}"
+    return {f"truth/{entity}/{place}": [field in fields for field in there]} if there else {}
 
 
 def _reference(layout: Layout) -> str:
@@ -314,14 +346,28 @@ def _signals(layout: Layout) -> rrb.Container:
         plot("Speed of the timetable [m/s]", f"bus/rebased_speed/{current}"),
     )
     return rrb.Grid(
-        plot("Position [m]", f"bus/position/{current}", f"reference/position_m{reference}"),
         plot(
-            "Acceleration [m/s²]",
-            f"bus/acceleration/{current}",
-            f"reference/acceleration_m_s2{reference}",
-            f"truth/acceleration_m_s2/{current}",
+            "Position: measured blue, reference orange [m]",
+            f"bus/motion/{current}",
+            f"reference/position_m{reference}",
+            legend=False,
+            shown=_motion(layout, "Position"),
         ),
-        plot("Force [N]", f"bus/force/{current}", f"truth/force_n/{current}"),
+        plot(
+            "Acceleration: measured blue, true green, reference orange [m/s²]",
+            f"bus/motion/{current}",
+            f"reference/acceleration_m_s2{reference}",
+            f"truth/{STATE}/{current}",
+            legend=False,
+            shown=_motion(layout, "Acceleration") | _true(layout, STATE, "acceleration_m_s2"),
+        ),
+        plot(
+            "Force: commanded blue, true green [N]",
+            f"bus/force/{current}",
+            f"truth/{STATE}/{current}",
+            legend=False,
+            shown=_true(layout, STATE, "force_n"),
+        ),
         plot(
             "Position error [m]",
             f"bus/position_error/{current}",
@@ -350,7 +396,16 @@ def _line(layout: Layout) -> rrb.Container:
 
     run = layout.run
     return rrb.Horizontal(
-        of_all(f"Space-time diagram, {TRAINS} [m]", f"truth/position_m/{run}"),
+        plot(
+            f"Space-time diagram, {TRAINS} [m]",
+            f"truth/{STATE}/{run}/**",
+            legend=False,
+            shown={
+                entity: lines
+                for train in range(layout.trains)
+                for entity, lines in _true(layout, STATE, "position_m", train=train).items()
+            },
+        ),
         rrb.Vertical(
             of_all("Separation from the train ahead [m]", f"truth/separation_m/{run}"),
             of_all("Distance to the barrier [m]", f"truth/barrier_distance_m/{run}"),

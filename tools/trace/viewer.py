@@ -144,18 +144,34 @@ def _add(stream: Any, recorded: Recorded, colour: Colour, first: bool) -> None:
 
     last = recorded.runs[-1]["run"]
     style = rr.SeriesLines(names=[recorded.label], colors=[colour], widths=[1.5])
-    for chunk in _chunks(recorded):
+    names = {  # of the lines of an entity
+        chunk.entity_path: chunk.to_record_batch().column("SeriesLines:names").to_pylist()[0]
+        for chunk in _chunks(recorded, static=True)
+        if chunk.entity_path.startswith("/truth/state/")
+    }
+    for chunk in _chunks(recorded, static=False):
         match chunk.entity_path.strip("/").split("/"):
-            case ["truth", field, run, *train] if field in OVERLAID and _number(run) == last:
+            case ["truth", _, run, *_] if _number(run) != last:
+                continue
+            case ["truth", "state", _, *train]:
+                batch = chunk.to_record_batch()
+                values = batch.column("Scalars:scalars")
+                table = values.flatten().to_numpy().reshape(len(values), -1)
+                index = [rr.TimeColumn("time", duration=batch.column("time").to_numpy())]
+                for field, column in zip(names[chunk.entity_path], table.T, strict=True):
+                    if field in OVERLAID:
+                        entity = "/".join([field, recorded.label, *train])
+                        stream.log(entity, style, static=True, strict=True)
+                        stream.send_columns(entity, index, rr.Scalars.columns(scalars=column))
+            case ["truth", field, _, *train] if field in OVERLAID:
                 entity = "/".join([field, recorded.label, *train])
                 stream.log(entity, style, static=True, strict=True)
+                stream.send_chunks([chunk.with_entity_path(f"/{entity}")])
             case ["reference", "speed_m_s"] if first:
                 entity = "speed_m_s/reference"
                 orange = rr.SeriesLines(names=["reference"], colors=[REFERENCE], widths=[1.5])
                 stream.log(entity, orange, static=True, strict=True)
-            case _:
-                continue
-        stream.send_chunks([chunk.with_entity_path(f"/{entity}")])
+                stream.send_chunks([chunk.with_entity_path(f"/{entity}")])
 
 
 def _number(run: str) -> int | None:
@@ -164,12 +180,12 @@ def _number(run: str) -> int | None:
     return int(digits) if digits.isdigit() else None
 
 
-def _chunks(recorded: Recorded) -> Iterator[Chunk]:
+def _chunks(recorded: Recorded, static: bool) -> Iterator[Chunk]:
     from rerun.chunk import RrdReader
 
     try:
         for chunk in RrdReader(str(recorded.trace)).stream():
-            if not chunk.is_static:
+            if chunk.is_static == static:
                 yield chunk
     except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]

@@ -3,13 +3,14 @@
 What is logged is what was on the bus, decoded by whole columns, with the true state of the plant
 beside it in a branch of its own:
 
-    /bus/PLOT/run_NN        signals of one plot, a vector a tick, units of the DBC
+    /bus/PLOT/run_NN        signals that come together, a vector a tick, units of the DBC
     /bus/state/run_NN/LANE  states and faults, a row a change
     /bus/frames/run_NN      every frame of a tick as it was: identifiers and payloads
     /bus/load/run_NN        load by message, kbit/s, a row a second; /bus/silence: longest, ms
     /bus/messages           table of what each message did in the run that is shown
     /bus/end_to_end/run_NN  what the end-to-end check says of each message, a row a change
-    /truth/FIELD/run_NN     true state of the plant, and its errors against the reference
+    /truth/state/run_NN     true state of the plant: a vector a tick, fields by name
+    /truth/FIELD/run_NN     what is looked at by itself: errors against the reference, supervision
     /reference/FIELD        the reference as planned
     /reference/FIELD/run_NN that of a run on a timetable of its own
     /timing/run_NN/FIELD    how punctual the nodes were in real time, µs
@@ -20,8 +21,12 @@ beside it in a branch of its own:
 
 Of a line of several trains, each run_NN has an entity train_NN for each of them.
 
-Timelines: `tick` (control period inside the run), `time` (simulated time inside the run), `run`.
-Runs share the first two, so that a view that takes a plot of several runs overlays them.
+Timelines: `time` (simulated time inside the run); frames, states and texts have `tick` (control
+period inside the run) and `run` besides; summaries have `run` alone. Runs share time and tick, so
+that a view that takes a plot of several runs overlays them.
+
+A row costs more than its values: what comes together is one entity, and a row that lies on the
+straight line between its neighbours is left out, since a plot draws that line anyway.
 """
 
 from __future__ import annotations
@@ -32,36 +37,20 @@ import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from ato_hil.can_dbc import pace
 from ato_hil.can_dbc.codec import (
-    ATO_RADIO,
-    ATO_STATUS,
-    ATO_TRACKING,
-    ATP_LIMIT,
-    CAR_FORCE_1,
-    CAR_FORCE_2,
-    CAR_FORCE_3,
-    CAR_FORCE_4,
-    FORCE_CMD,
     MESSAGES,
-    NEIGHBOUR_AHEAD_MOTION,
-    NEIGHBOUR_AHEAD_POSITION,
-    NEIGHBOUR_BEHIND_MOTION,
-    NEIGHBOUR_BEHIND_POSITION,
     RUN_CTRL,
-    TRAIN_POSITION,
-    TRAIN_SPEED,
-    database,
     decode_column,
 )
 from ato_hil.can_dbc.errors import InputError
 from ato_hil.can_dbc.faults import Event
-from ato_hil.controller.interface import fault_names
-from ato_hil.tools.runs.frames import columns, estimate, physical
+from ato_hil.tools.runs.folder import LIMITS, STATE
+from ato_hil.tools.runs.frames import columns, estimate
 from ato_hil.tools.trace import charts
 from ato_hil.tools.trace.blueprints import (
     BARS,
@@ -71,25 +60,28 @@ from ato_hil.tools.trace.blueprints import (
 )
 from ato_hil.tools.trace.charts import Curve, curves, memory_map
 from ato_hil.tools.trace.colours import (
-    AHEAD,
-    APART,
-    BEHIND,
     BLUE,
-    COMMANDED,
     GREY,
-    MEASURED,
-    ORANGE,
-    PERMITTED,
-    PINK,
     REFERENCE,
     STATES,
-    TARGET,
     TRUE,
-    VIOLET,
-    YELLOW,
     Colour,
     apart,
     ramp,
+)
+from ato_hil.tools.trace.plots import (
+    LANES,
+    MAX_CARS,
+    PLOTS,
+    SUPERVISION,
+    THIN,
+    WIDE,
+    Lane,
+    car_force_plot,
+    corners,
+    state_names,
+    state_text,
+    table_of,
 )
 from ato_hil.tools.trace.traffic import (
     CHECKS,
@@ -102,137 +94,12 @@ from ato_hil.tools.trace.traffic import (
 if TYPE_CHECKING:
     import rerun as rr
 
-MAX_CARS = 8
-
-WIDE = 4.0  # a wide line stays visible under a thin one
-THIN = 1.5
 WINDOW_S = 1.0  # of load and silence
 LIVE_MEMORY = "1GiB"  # that the server of live viewers may keep; then it drops the oldest
 
 
-class Line(NamedTuple):
-    """One signal in a plot."""
-
-    message: Any  # of codec.MESSAGES
-    signal: str
-    label: str
-    colour: Colour
-    width: float = THIN
-
-
-class Plot(NamedTuple):
-    """Signals with one unit and one cycle time: one entity with a vector of scalars."""
-
-    name: str
-    unit: str
-    lines: tuple[Line, ...]
-
-
-PLOTS = (
-    Plot(
-        "speed",
-        "m/s",
-        (
-            Line(TRAIN_SPEED, "Speed", "measured", MEASURED, WIDE),
-            Line(ATP_LIMIT, "TargetSpeed", "target", TARGET),
-            Line(ATP_LIMIT, "PermittedSpeed", "permitted", PERMITTED),
-        ),
-    ),
-    Plot("position", "m", (Line(TRAIN_POSITION, "Position", "measured", MEASURED, WIDE),)),
-    Plot("acceleration", "m/s²", (Line(TRAIN_SPEED, "Acceleration", "measured", MEASURED, WIDE),)),
-    Plot("force", "N", (Line(FORCE_CMD, "Force", "commanded", COMMANDED, WIDE),)),
-    Plot("target_distance", "m", (Line(ATP_LIMIT, "TargetDistance", "to target", TARGET),)),
-    Plot("position_error", "m", (Line(ATO_TRACKING, "PositionError", "controller", BLUE),)),
-    Plot("speed_error", "m/s", (Line(ATO_TRACKING, "SpeedError", "controller", BLUE),)),
-    Plot(
-        "tick",
-        "",
-        (
-            Line(TRAIN_POSITION, "Tick", "sent", BLUE),
-            Line(FORCE_CMD, "Tick", "echoed", ORANGE),
-        ),
-    ),
-    Plot(
-        "iteration",
-        "",
-        (
-            Line(RUN_CTRL, "Iteration", "plant", BLUE),
-            Line(ATO_STATUS, "Iteration", "controller", ORANGE),
-        ),
-    ),
-    Plot("timetable_rate", "", (Line(RUN_CTRL, "TimetableRate", "announced, less 1", BLUE),)),
-    Plot(
-        "neighbour_position",
-        "m",
-        (
-            Line(NEIGHBOUR_AHEAD_POSITION, "Position", "ahead", AHEAD),
-            Line(NEIGHBOUR_BEHIND_POSITION, "Position", "behind", BEHIND),
-        ),
-    ),
-    Plot(
-        "neighbour_age",
-        "s",
-        (
-            Line(NEIGHBOUR_AHEAD_POSITION, "Age", "ahead", AHEAD),
-            Line(NEIGHBOUR_BEHIND_POSITION, "Age", "behind", BEHIND),
-        ),
-    ),
-    Plot(
-        "neighbour_speed",
-        "m/s",
-        (
-            Line(NEIGHBOUR_AHEAD_MOTION, "Speed", "ahead", AHEAD),
-            Line(NEIGHBOUR_BEHIND_MOTION, "Speed", "behind", BEHIND),
-            Line(NEIGHBOUR_AHEAD_MOTION, "OffsetSpeed", "ahead, re-based", YELLOW),
-            Line(NEIGHBOUR_BEHIND_MOTION, "OffsetSpeed", "behind, re-based", PINK),
-        ),
-    ),
-    Plot("rebased_position", "m", (Line(ATO_RADIO, "Offset", "own timetable", BLUE),)),
-    Plot("rebased_speed", "m/s", (Line(ATO_RADIO, "OffsetSpeed", "own timetable", BLUE),)),
-)
-
-CAR_FORCES = (CAR_FORCE_1, CAR_FORCE_2, CAR_FORCE_3, CAR_FORCE_4)  # two cars each
-
-
-class Lane(NamedTuple):
-    """A signal whose value is a state: shown as a coloured lane, logged when it changes."""
-
-    name: str
-    message: Any  # of codec.MESSAGES
-    signal: str
-
-
-LANES = (
-    Lane("mode", FORCE_CMD, "Mode"),
-    Lane("supervision", ATP_LIMIT, "Supervision"),
-    Lane("guard", ATO_STATUS, "Guard"),
-    Lane("faults", ATO_STATUS, "Faults"),
-    Lane("sensor", TRAIN_SPEED, "Quality"),
-    Lane("law", ATO_STATUS, "Law"),
-    Lane("run_plant", RUN_CTRL, "RunState"),
-    Lane("run_controller", ATO_STATUS, "RunState"),
-    Lane("pace", RUN_CTRL, "Pace"),
-    Lane("ahead_valid", NEIGHBOUR_AHEAD_POSITION, "Valid"),
-    Lane("ahead_emergency_brake", NEIGHBOUR_AHEAD_POSITION, "EmergencyBrake"),
-    Lane("ahead_rebased", NEIGHBOUR_AHEAD_POSITION, "Rebased"),
-    Lane("behind_valid", NEIGHBOUR_BEHIND_POSITION, "Valid"),
-    Lane("behind_emergency_brake", NEIGHBOUR_BEHIND_POSITION, "EmergencyBrake"),
-    Lane("behind_rebased", NEIGHBOUR_BEHIND_POSITION, "Rebased"),
-    Lane("rebased", ATO_RADIO, "Rebased"),
-    Lane("emergency_brake_to_rear", ATO_RADIO, "EmergencyBrakeToRear"),
-    Lane("emergency_brake_to_front", ATO_RADIO, "EmergencyBrakeToFront"),
-)
 # True errors: what is compared with the reference column of the same name.
 ERRORS = {"position_error_m": "position_m", "speed_error_m_s": "speed_m_s"}
-
-# True speeds that supervise the train, where the plant has them; they are drawn beside its own.
-SUPERVISION = {
-    "permitted_speed_m_s": PERMITTED,
-    "warning_speed_m_s": YELLOW,
-    "service_brake_speed_m_s": PINK,
-    "emergency_brake_speed_m_s": VIOLET,
-    "emergency_deceleration_speed_m_s": GREY,
-}
 
 
 class TraceError(InputError):
@@ -302,14 +169,14 @@ class TraceWriter:
         self._references: dict[int, Reference] = {}  # of runs on a timetable of their own
         self._cars = cars
         self._estimates = tuple(estimates)
-        self._plots = (*PLOTS, _car_force_plot(cars)) if cars else PLOTS
-        self._state_names = {lane.name: _state_names(lane) for lane in LANES}
+        self._plots = (*PLOTS, car_force_plot(cars)) if cars else PLOTS
+        self._state_names = {lane.name: state_names(lane) for lane in LANES}
         self._words = tuple(words)
         self._window_ticks = max(round(WINDOW_S / period_s), 1)
         self._period_s = period_s
         self._run: int | None = None
         self._layout: Layout | None = None
-        self._curves: tuple[str, ...] = ()
+        self._fields: tuple[str, ...] = ()  # of the plant's state
         self._states: dict[str, int] = {}  # last value of each lane, by its entity
         self._traffic: dict[int, tuple[int, Traffic, Checks]] = {}  # run and state, by train
         self._memory: dict[int, np.ndarray] = {}  # [words, positions], by run
@@ -352,18 +219,17 @@ class TraceWriter:
             self._run = run
             self._show()
         for plot in self._plots:
-            ticks, values = _table(plot, found)
+            ticks, values = table_of(plot, found)
             names = [line.label for line in plot.lines]
             colours = [line.colour for line in plot.lines]
             widths = [line.width for line in plot.lines]
             entity = self._entity(f"bus/{plot.name}", run, train)
-            self._log_scalars(entity, self._index(ticks, run), values, names, colours, widths)
+            self._log_scalars(entity, ticks, values, names, colours, widths)
         for number, name in enumerate(self._estimates):
             ticks, value = estimate(frames, number)
             entity = self._entity(f"bus/estimate_{number}", run, train)
-            index = self._index(ticks, run)
             colour = self._colour(run, train)
-            self._log_scalars(entity, index, value[:, None], [name], [colour])
+            self._log_scalars(entity, ticks, value[:, None], [name], [colour])
         for lane in LANES:
             self._log_lane(run, train, lane, *found[lane.message.name])
         self._log_traffic(run, train, frames, found)
@@ -379,43 +245,45 @@ class TraceWriter:
     def _log_reference(self, branch: str, reference: Reference) -> None:
         for field in ("position_m", "speed_m_s", "acceleration_m_s2"):
             values = getattr(reference, field)[:, None]
-            index = self._index(np.arange(len(values)))
+            ticks = np.arange(len(values))
             self._log_scalars(
-                f"reference/{field}{branch}", index, values, ["reference"], [REFERENCE]
+                f"reference/{field}{branch}", ticks, values, ["reference"], [REFERENCE]
             )
 
     def truth(self, run: int, table: np.ndarray, train: int = 0) -> None:
         """Log the true state of the plant: a structured array of float64 fields, a row a tick.
 
         The names of the fields end in their units; a field of NaN alone is none of this train's.
-        The errors of `position_m` and `speed_m_s` against the reference are logged beside them.
+        A table with `position_m` is the plant's state: it shares one entity, the speeds that
+        supervise the train another, and its errors against the reference are logged beside it. Of
+        another table, such as the Lyapunov function, each field is an entity.
         """
-        index = self._index(np.arange(len(table)), run)
-        colour = self._colour(run, train)
+        ticks = np.arange(len(table))
         label = self._run_name(run) if self._trains == 1 else f"train_{train + 1}"
-        label = label.replace("_", " ")
-        single = self._trains == 1
+        own = ([label.replace("_", " ")], [self._colour(run, train)])
         fields = [name for name in table.dtype.names or () if not np.isnan(table[name]).all()]
-        for field in fields:
-            entity = self._entity(f"truth/{field}", run, train)
-            style = (["true"], [TRUE]) if single else ([label], [colour])
-            if field in SUPERVISION:
-                style = ([field.removesuffix("_speed_m_s").replace("_", " ")], [SUPERVISION[field]])
-            self._log_scalars(entity, index, table[field][:, None], *style)
-        for error, field in ERRORS.items():
-            if field not in (table.dtype.names or ()):
-                continue  # a column of its own, such as the Lyapunov function
-            reference = getattr(self._references.get(run, self._reference), field)
-            if field == "position_m":
-                reference = reference - train * self._spacing_m
-            count = min(len(table), len(reference))
-            values = (table[field][:count] - reference[:count])[:, None]
-            entity = self._entity(f"truth/{error}", run, train)
-            index = self._index(np.arange(count), run)
-            self._log_scalars(entity, index, values, [label], [colour])
+        if "position_m" in fields:
+            state = [field for field in fields if field not in SUPERVISION]
+            colour = TRUE if self._trains == 1 else self._colour(run, train)
+            self._log_fields(f"truth/{STATE}", run, train, table, state, [colour] * len(state))
+            limits = [field for field in fields if field in SUPERVISION]
+            colours = [SUPERVISION[field] for field in limits]
+            self._log_fields(f"truth/{LIMITS}", run, train, table, limits, colours)
+            for error, field in ERRORS.items():
+                reference = getattr(self._references.get(run, self._reference), field)
+                if field == "position_m":
+                    reference = reference - train * self._spacing_m
+                count = min(len(table), len(reference))
+                values = (table[field][:count] - reference[:count])[:, None]
+                entity = self._entity(f"truth/{error}", run, train)
+                self._log_scalars(entity, ticks[:count], values, *own)
+        else:
+            for field in fields:
+                entity = self._entity(f"truth/{field}", run, train)
+                self._log_scalars(entity, ticks, table[field][:, None], *own)
         if train == 0 and {"position_m", "speed_m_s"} <= set(fields):
             # The limit is on the bus already; what else supervises the train is known here alone.
-            self._curves = tuple(name for name in list(SUPERVISION)[1:] if name in fields)
+            self._fields = tuple(fields)
             self._log_speed_over_position(run, table, fields)
             self._show()
 
@@ -448,7 +316,7 @@ class TraceWriter:
         A field of several columns has one for each node: the plant, then the controllers. Each
         field gets a bar chart over powers of two besides.
         """
-        index = self._index(np.arange(len(table)), run)
+        ticks = np.arange(len(table))
         for field in table.dtype.names or ():
             values = table[field].reshape(len(table), -1)
             names = ["plant", "controller"]
@@ -458,7 +326,7 @@ class TraceWriter:
                 names[1:] = [f"controller {train + 1}" for train in range(values.shape[1] - 1)]
             colours = [apart(column) for column in range(len(names))]
             entity = f"timing/{self._run_name(run)}/{field}"
-            self._log_scalars(entity, index, values, names, colours)
+            self._log_scalars(entity, ticks, values, names, colours)
             histogram = pace.Histogram()
             histogram.add(values[np.isfinite(values)].astype(np.int64))
             counts = [count for _from_us, count in histogram.octaves()]
@@ -476,7 +344,8 @@ class TraceWriter:
         self._summary.append({"run": run, **numbers})
         index = [rr.TimeColumn("run", sequence=[run])]
         for key, value in numbers.items():
-            self._log_scalars(f"runs/{key}", index, np.array([[value]]), [title_of(key)], [BLUE])
+            self._style(f"runs/{key}", [title_of(key)], [BLUE])
+            self._send(f"runs/{key}", index, rr.Scalars.columns(scalars=[value]))
         for key in BARS:
             rows = [each for each in self._summary if key in each]
             if rows:
@@ -499,7 +368,8 @@ class TraceWriter:
     def text(self, run: int, tick: int, message: str, level: str = "INFO", train: int = 0) -> None:
         """Log an event; `level` is one of Rerun's: INFO, WARN, ERROR, CRITICAL."""
         content = self._rr.TextLog.columns(text=[message], level=[level])
-        self._send("events" + self._branch(train), self._index(np.array([tick]), run), content)
+        index = self._index(np.array([tick]), run)
+        self._send("events" + self._branch(train), index, content)
 
     def faults(self, run: int, events: Sequence[Event], train: int = 0) -> None:
         """Log the faults that were injected in a run."""
@@ -555,7 +425,7 @@ class TraceWriter:
             trains=self._trains,
             own_timetable=self._run in self._references,
             length_m=float(self._reference.position_m[-1]),
-            curves=self._curves,
+            fields=self._fields,
             words=self._words if self._memory else (),
             timing=any(entity.startswith("timing/") for entity in self._logged),
         )
@@ -585,33 +455,60 @@ class TraceWriter:
         return ramp((run - self._first_run) / max(self._last_run - self._first_run, 1))
 
     def _index(self, ticks: np.ndarray, run: int | None = None) -> list[rr.TimeColumn]:
-        """Columns of the timelines for rows at these ticks."""
+        """Columns of the timelines for rows at these ticks: `time`, and with a run the others."""
         time_ns = (ticks.astype(np.int64) * self._period_ns).astype("timedelta64[ns]")
-        index = [
-            self._rr.TimeColumn("tick", sequence=ticks),
-            self._rr.TimeColumn("time", duration=time_ns),
-        ]
+        index = [self._rr.TimeColumn("time", duration=time_ns)]
         if run is not None:
+            index.append(self._rr.TimeColumn("tick", sequence=ticks))
             index.append(self._rr.TimeColumn("run", sequence=np.full(len(ticks), run)))
         return index
+
+    def _log_fields(
+        self,
+        entity: str,
+        run: int,
+        train: int,
+        table: np.ndarray,
+        fields: Sequence[str],
+        colours: list[Colour],
+    ) -> None:
+        """Log columns of a table as the lines of one entity, named as the fields."""
+        if fields:
+            values = np.column_stack([table[field] for field in fields])
+            place = self._entity(entity, run, train)
+            ticks = np.arange(len(table))
+            self._log_scalars(place, ticks, values, list(fields), colours, ramps=False)
 
     def _log_scalars(
         self,
         entity: str,
-        index: list[rr.TimeColumn],
+        ticks: np.ndarray,
         values: np.ndarray,
         names: list[str],
         colours: list[Colour],
         widths: Sequence[float] = (THIN,),
+        ramps: bool = True,
     ) -> None:
-        """Log a table of values (rows, lines); the first time, also how to draw its lines."""
+        """Log a table of values (rows, lines); the first time, also how to draw its lines. Rows are
+        left out as `corners` says."""
         if len(values) == 0:
             return
+        self._style(entity, names, colours, widths)
+        kept = corners(ticks, values, ramps)
+        content = self._rr.Scalars.columns(scalars=values[kept])
+        self._send(entity, self._index(ticks[kept]), content)
+
+    def _style(
+        self,
+        entity: str,
+        names: list[str],
+        colours: list[Colour],
+        widths: Sequence[float] = (THIN,),
+    ) -> None:
         if entity not in self._logged:
             self._logged.add(entity)
             style = self._rr.SeriesLines(names=names, colors=colours, widths=widths)
             self._log(entity, style)
-        self._send(entity, index, self._rr.Scalars.columns(scalars=values))
 
     def _log_lane(
         self, run: int, train: int, lane: Lane, ticks: np.ndarray, words: np.ndarray
@@ -644,9 +541,7 @@ class TraceWriter:
             colours = [STATES.get(name, GREY) for name in names.values()]
             style = self._rr.StateConfiguration(values=[*names.values()], colors=colours)
             self._log(entity, style)
-        states = [
-            names.get(value) or _state_text(lane, value) for value in values[changes].tolist()
-        ]
+        states = [names.get(value) or state_text(lane, value) for value in values[changes].tolist()]
         index = self._index(ticks[changes], run)
         self._send(entity, index, self._rr.StateChange.columns(state=states))
 
@@ -675,13 +570,12 @@ class TraceWriter:
             self._log("bus/messages", table)
 
     def _log_windows(self, run: int, train: int, traffic: Traffic, windows: Windows) -> None:
-        index = self._index(windows.first_ticks, run)
         for number in np.flatnonzero(traffic.heard):
             for kind, values in (("load", windows.load_kbit_s), ("silence", windows.silence_ms)):
                 entity = self._entity(f"bus/{kind}", run, train) + f"/{NAMES[number]}"
                 colour = apart(int(number))
                 self._log_scalars(
-                    entity, index, values[:, number : number + 1], [NAMES[number]], [colour]
+                    entity, windows.first_ticks, values[:, number, None], [NAMES[number]], [colour]
                 )
 
     def _log_speed_over_position(self, run: int, table: np.ndarray, fields: Sequence[str]) -> None:
@@ -718,47 +612,6 @@ class TraceWriter:
     def _log_drawing(self, entity: str, drawing: Mapping[str, Any]) -> None:
         for name, content in drawing.items():
             self._log(f"{entity}/{name}", content)
-
-
-def _car_force_plot(cars: int) -> Plot:
-    lines = [
-        Line(CAR_FORCES[car // 2], f"Car{car + 1}", f"car {car + 1}", APART[car])
-        for car in range(cars)
-    ]
-    return Plot("car_force", "N", tuple(lines))
-
-
-def _table(
-    plot: Plot, found: dict[str, tuple[np.ndarray, np.ndarray]]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Ticks, and physical values (ticks, lines): NaN where a tick lacks the message.
-
-    Of several frames of one message in a tick, the last counts.
-    """
-    ticks = found[plot.lines[0].message.name][0]
-    for line in plot.lines[1:]:
-        others = found[line.message.name][0]
-        if others is not ticks and not np.array_equal(others, ticks):
-            ticks = np.union1d(ticks, others)
-    values = np.full((len(ticks), len(plot.lines)), np.nan)
-    for column, line in enumerate(plot.lines):
-        at, words = found[line.message.name]
-        values[np.searchsorted(ticks, at), column] = physical(words, line.message, line.signal)
-    return ticks, values
-
-
-def _state_names(lane: Lane) -> dict[int, str]:
-    """Names of the values of a state, from the DBC where it has them."""
-    signal = database().get_message_by_name(lane.message.name).get_signal_by_name(lane.signal)
-    if signal.choices:
-        return {int(value): str(name) for value, name in signal.choices.items()}
-    return {0: "no", 1: "yes"} if signal.length == 1 else {0: "none"}
-
-
-def _state_text(lane: Lane | None, value: int) -> str:
-    """Text for a value that has no name: a set of faults, or nothing that the DBC knows."""
-    known = ", ".join(fault_names(value)) if lane and lane.signal == "Faults" else ""
-    return known or f"{value:#x}"
 
 
 def _markdown(rows: list[dict[str, Any]]) -> str:

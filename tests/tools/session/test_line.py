@@ -102,7 +102,7 @@ def test_hil_with_a_bus_for_each_train_gives_the_bits_of_sil(ato_hil, tmp_path: 
     ]
     assert entities[0] == entities[1]
     for entity in (
-        "/truth/position_m/run_01/train_03",
+        "/truth/state/run_01/train_03",
         "/truth/separation_m/run_02/train_02",
         "/truth/barrier_distance_m/run_01/train_01",
         "/bus/neighbour_age/run_01/train_02",

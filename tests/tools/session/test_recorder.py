@@ -433,7 +433,7 @@ def test_two_runs_over_the_hub_with_trace(start: Start, tmp_path: Path) -> None:
     RrdReader(str(tmp_path / "trace.rrd")).store()  # refuses a file without footer
     found = entities(tmp_path / "trace.rrd")
     for name in ("run_01", "run_02"):
-        assert {f"/bus/speed/{name}", f"/bus/frames/{name}", f"/truth/speed_m_s/{name}"} <= found
+        assert {f"/bus/motion/{name}", f"/bus/frames/{name}", f"/truth/state/{name}"} <= found
     assert "/runs/max_position_error_m" in found
 
 
@@ -455,7 +455,7 @@ def test_every_end_keeps_a_run_that_is_under_way(start: Start, tmp_path: Path, e
     assert event["ticks"] == 30
     assert event["complete"] is False
     RrdReader(str(tmp_path / "trace.rrd")).store()
-    assert "/bus/speed/run_01" in entities(tmp_path / "trace.rrd")
+    assert "/bus/motion/run_01" in entities(tmp_path / "trace.rrd")
 
 
 def test_a_recorder_with_viewers_serves_them_on_after_its_trace_is_complete(
@@ -495,7 +495,7 @@ def test_a_killed_recorder_leaves_what_it_had_logged(start: Start, tmp_path: Pat
         process.kill()
         process.wait()
     with pytest.warns(RerunWarning, match="no footer"):
-        assert "/bus/speed/run_01" in entities(tmp_path / "trace.rrd")
+        assert "/bus/motion/run_01" in entities(tmp_path / "trace.rrd")
 
 
 def wait_for_text(path: Path, text: bytes) -> None:
@@ -516,7 +516,7 @@ def test_a_hub_that_dies_is_an_error_and_the_trace_is_kept(start: Start, tmp_pat
         assert event["message"].startswith("recorder: bus hub is gone: ")
         assert process.wait(30) == 2
     RrdReader(str(tmp_path / "trace.rrd")).store()
-    assert "/bus/speed/run_01" in entities(tmp_path / "trace.rrd")
+    assert "/bus/motion/run_01" in entities(tmp_path / "trace.rrd")
 
 
 def test_frames_that_the_hub_drops_are_counted(start: Start, hub_with, tmp_path: Path) -> None:

@@ -18,6 +18,9 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from ato_hil.can_dbc.codec import TRAIN_SPEED
+from ato_hil.tools.runs import folder
+from ato_hil.tools.runs.frames import decode
 from ato_hil.tools.session import session
 from ato_hil.tools.trace import live_viewer
 from ato_hil.tools.trace.live_viewer import LiveView, ViewerError
@@ -92,9 +95,9 @@ def test_a_port_that_is_taken_does_not_touch_the_file(tmp_path: Path) -> None:
     rows = sum(
         chunk.num_rows
         for chunk in RrdReader(str(tmp_path / "trace.rrd")).stream()
-        if chunk.entity_path == "/truth/position_m/run_01" and not chunk.is_static
+        if chunk.entity_path == "/truth/state/run_01" and not chunk.is_static
     )
-    assert rows == TICKS
+    assert rows == 2  # nothing changes
 
 
 def test_the_viewer_sends_no_usage_data(settings: Path) -> None:
@@ -246,7 +249,7 @@ def test_a_session_that_is_told_to_end_keeps_all_of_the_runs_that_it_has_finishe
     for row in summary["runs"]:
         entity = f"run_{row['run']:03d}"
         assert found[f"/bus/frames/{entity}"] == row["ticks"]
-        assert found[f"/truth/position_m/{entity}"] == row["ticks"]
+        assert f"/truth/state/{entity}" in found
     verified = subprocess.run(
         [str(live_viewer.binary()), "rrd", "verify", str(tmp_path / "trace.rrd")],
         env=live_viewer.environment(),
@@ -273,18 +276,9 @@ def test_a_trace_of_250_000_ticks_loads_and_is_whole(tmp_path: Path) -> None:
     summary = session.run(options, Silent(None))
     ticks = summary["runs"][0]["ticks"]
     assert ticks > 200_000
-    columns: dict[str, list[np.ndarray]] = {}
-    for chunk in RrdReader(str(tmp_path / "trace.rrd")).stream():
-        wanted = chunk.entity_path in ("/truth/speed_m_s/run_01", "/bus/speed/run_01")
-        if wanted and not chunk.is_static:
-            batch = chunk.to_record_batch()
-            tick = batch.column("tick").to_numpy()
-            values = batch.column("Scalars:scalars").flatten().to_numpy()
-            columns.setdefault(chunk.entity_path, []).append(
-                np.column_stack((tick, values.reshape(len(tick), -1)[:, 0]))
-            )
-    truth = np.concatenate(columns["/truth/speed_m_s/run_01"])
-    measured = np.concatenate(columns["/bus/speed/run_01"])
-    for table in (truth, measured):
-        assert table[:, 0].tolist() == list(range(ticks))
-    assert np.abs(truth[:, 1] - measured[:, 1]).max() < 1.0
+    (run,) = folder.read(tmp_path)
+    truth = run.truths[0]["speed_m_s"]
+    at, measured = decode(run.frames[0], TRAIN_SPEED, "Speed")
+    assert len(truth) == ticks
+    assert at.tolist() == list(range(ticks))
+    assert np.abs(truth - measured).max() < 1.0

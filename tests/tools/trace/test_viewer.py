@@ -75,9 +75,11 @@ def test_the_last_runs_of_several_sessions_share_their_plots(tmp_path: Path) -> 
     ]
     overlay(load(folders), tmp_path / "both.rrd")
     found = read(tmp_path / "both.rrd")
-    assert scalars(found["/speed_m_s/cailc"]) == [3.0] * TICKS
-    assert scalars(found["/speed_m_s/pid_x"]) == [20.0] * TICKS
-    assert scalars(found["/speed_m_s/reference"]) == np.linspace(0.0, 5.0, TICKS).tolist()
+    # Where nothing changes, the first and the last are enough.
+    assert scalars(found["/speed_m_s/cailc"]) == [3.0] * 2
+    assert scalars(found["/speed_m_s/pid_x"]) == [20.0] * 2
+    reference = scalars(found["/speed_m_s/reference"])
+    assert (reference[0], reference[-1]) == (0.0, 5.0)
     names = [
         name
         for batch in found["/speed_m_s/pid_x"]

@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from rerun.chunk import RrdReader
 
 from ato_hil.can_dbc.codec import (
@@ -32,14 +35,8 @@ from ato_hil.tools.runs.frames import (
     estimate,
 )
 from ato_hil.tools.trace.blueprints import title_of
-from ato_hil.tools.trace.writer import (
-    LANES,
-    MAX_CARS,
-    PLOTS,
-    TraceError,
-    TraceWriter,
-    _car_force_plot,
-)
+from ato_hil.tools.trace.plots import LANES, MAX_CARS, PLOTS, car_force_plot, corners
+from ato_hil.tools.trace.writer import TraceError, TraceWriter
 
 TICKS = 60
 PERIOD_S = 0.01
@@ -106,7 +103,17 @@ class Trace:
         return np.array(self.column(entity, name))
 
     def ticks(self, entity: str) -> list[int]:
-        return self.column(entity, "tick")
+        return [round(value.total_seconds() / PERIOD_S) for value in self.column(entity, "time")]
+
+    def lines(self, entity: str) -> dict[str, np.ndarray]:
+        """Columns by the name of their line; rows that were left out are put in again."""
+        (names,) = self.static[entity][0].column("SeriesLines:names").to_pylist()
+        ticks, values = self.ticks(entity), self.values(entity)
+        every = np.arange(ticks[0], ticks[-1] + 1)
+        return {
+            name: np.interp(every, ticks, column)
+            for name, column in zip(names, values.T, strict=True)
+        }
 
     def frames(self, entity: str) -> np.ndarray:
         """FRAME rows, from the frames as they were."""
@@ -126,7 +133,7 @@ class Trace:
 def test_every_signal_of_the_bus_has_its_place() -> None:
     placed = {(line.message.name, line.signal) for plot in PLOTS for line in plot.lines}
     placed |= {(lane.message.name, lane.signal) for lane in LANES}
-    car_forces = _car_force_plot(MAX_CARS)
+    car_forces = car_force_plot(MAX_CARS)
     placed |= {(line.message.name, line.signal) for line in car_forces.lines}
     for message in database().messages:
         if message.name == ATO_ESTIMATE.name:
@@ -137,14 +144,15 @@ def test_every_signal_of_the_bus_has_its_place() -> None:
 
 
 def test_the_signals_of_a_plot_share_unit_and_cycle_time() -> None:
-    for plot in (*PLOTS, _car_force_plot(MAX_CARS)):
+    for plot in (*PLOTS, car_force_plot(MAX_CARS)):
         source = [
             database().get_message_by_name(line.message.name).get_signal_by_name(line.signal)
             for line in plot.lines
         ]
         assert len({line.message.cycle_ms for line in plot.lines}) == 1
         unit = plot.unit.replace("²", "^2")
-        assert {signal.unit or "" for signal in source} == {unit}
+        if plot.name != "motion":
+            assert {signal.unit or "" for signal in source} == {unit}
 
 
 def test_plots_hold_the_physical_values_of_the_frames(tmp_path: Path) -> None:
@@ -153,7 +161,7 @@ def test_plots_hold_the_physical_values_of_the_frames(tmp_path: Path) -> None:
     writer.frames(1, frames)
     writer.close()
     written = Trace(tmp_path / "trace.rrd")
-    for plot in (*PLOTS, _car_force_plot(8)):
+    for plot in (*PLOTS, car_force_plot(8)):
         entity = f"/bus/{plot.name}/run_01"
         table = written.values(entity)
         assert table.shape[1] == len(plot.lines)
@@ -209,21 +217,43 @@ def test_batches_give_the_same_tables_as_one_piece(tmp_path: Path) -> None:
                 assert one.column(entity, name) == three.column(entity, name), (entity, name)
 
 
-def test_timelines_are_tick_simulated_time_and_run(tmp_path: Path) -> None:
+def test_timelines_are_simulated_time_and_of_what_happens_tick_and_run(tmp_path: Path) -> None:
     writer = open_writer(tmp_path / "trace.rrd", last_run=120)
     writer.frames(7, random_frames(3))
     writer.close()
     written = Trace(tmp_path / "trace.rrd")
-    entity = "/bus/speed/run_007"
+    entity = "/bus/frames/run_007"
     assert written.column(entity, "tick") == [0, 1, 2]
     assert [value.total_seconds() for value in written.column(entity, "time")] == [0, 0.01, 0.02]
     assert written.column(entity, "run") == [7, 7, 7]
-    assert set(written.chunks["/reference/speed_m_s"][0].schema.names) == {
-        "rerun.controls.RowId",
-        "tick",
-        "time",
-        "Scalars:scalars",
-    }
+    for entity in ("/reference/speed_m_s", "/bus/motion/run_007"):
+        assert set(written.chunks[entity][0].schema.names) == {
+            "rerun.controls.RowId",
+            "time",
+            "Scalars:scalars",
+        }
+
+
+@given(
+    values=arrays(
+        np.int64, st.tuples(st.integers(1, 40), st.integers(1, 3)), elements=st.integers(0, 2)
+    ),
+    ramps=st.booleans(),
+)
+def test_what_is_left_out_lies_between_its_neighbours(values: np.ndarray, ramps: bool) -> None:
+    table = np.cumsum(values, axis=0).astype(float) if ramps else values.astype(float)
+    ticks = np.arange(len(table))
+    kept = corners(ticks, table, ramps)
+    for column in table.T:
+        assert np.interp(ticks, ticks[kept], column[kept]).tolist() == column.tolist()
+    equal = np.all(table == table[0])
+    assert kept.sum() == (min(2, len(table)) if equal else kept.sum())
+
+
+def test_a_gap_and_a_missing_tick_are_no_straight_line() -> None:
+    values = np.array([[1.0], [1.0], [np.nan], [1.0], [1.0], [1.0]])
+    assert corners(np.arange(6), values).tolist() == [True, True, True, True, False, True]
+    assert corners(np.array([0, 1, 3, 4]), np.ones((4, 1))).tolist() == [True] * 4
 
 
 def test_a_tick_that_lacks_a_message_is_a_gap(tmp_path: Path) -> None:
@@ -238,8 +268,8 @@ def test_a_tick_that_lacks_a_message_is_a_gap(tmp_path: Path) -> None:
     writer.frames(1, np.array(rows, FRAME))
     writer.close()
     written = Trace(tmp_path / "trace.rrd")
-    labels = written.static["/bus/speed/run_01"][0].column("SeriesLines:names").to_pylist()[0]
-    table = written.values("/bus/speed/run_01")
+    labels = written.static["/bus/motion/run_01"][0].column("SeriesLines:names").to_pylist()[0]
+    table = written.values("/bus/motion/run_01")
     measured, permitted = table[:, labels.index("measured")], table[:, labels.index("permitted")]
     np.testing.assert_array_equal(measured, [1.0, np.nan, 4.0])
     np.testing.assert_array_equal(permitted, [1.0, 2.0, np.nan])
@@ -304,33 +334,31 @@ def test_truth_and_its_errors_against_the_reference(tmp_path: Path) -> None:
     writer.truth(3, table)
     writer.close()
     written = Trace(tmp_path / "trace.rrd")
-    for field in TRUTH.names or ():
-        assert written.values(f"/truth/{field}/run_03")[:, 0].tolist() == table[field].tolist()
-    position_error = written.values("/truth/position_error_m/run_03")[:, 0]
-    speed_error = written.values("/truth/speed_error_m_s/run_03")[:, 0]
+    state = written.lines("/truth/state/run_03")
+    assert {name: column.tolist() for name, column in state.items()} == {
+        name: table[name].tolist() for name in TRUTH.names or ()
+    }
+    (position_error,) = written.lines("/truth/position_error_m/run_03").values()
+    (speed_error,) = written.lines("/truth/speed_error_m_s/run_03").values()
     np.testing.assert_allclose(position_error, np.full(TICKS - 20, 0.25))
     np.testing.assert_allclose(speed_error, np.full(TICKS - 20, -0.5))
     for field in ("position_m", "speed_m_s", "acceleration_m_s2"):
-        logged = written.values(f"/reference/{field}")[:, 0]
-        assert logged.tolist() == getattr(REFERENCE, field).tolist()
+        (logged,) = written.lines(f"/reference/{field}").values()
+        np.testing.assert_allclose(logged, getattr(REFERENCE, field), rtol=1e-15)
 
 
 def test_the_curves_of_atp_have_names_and_those_that_limit_nothing_are_left_out(
     tmp_path: Path,
 ) -> None:
-    names = ("speed_m_s", "warning_speed_m_s", "emergency_brake_speed_m_s")
+    names = ("position_m", "speed_m_s", "warning_speed_m_s", "emergency_brake_speed_m_s")
     table = np.zeros(TICKS, np.dtype([(name, np.float64) for name in names]))
     table["emergency_brake_speed_m_s"] = np.nan
-    writer = open_writer(tmp_path / "trace.rrd")
+    writer = open_writer(tmp_path / "trace.rrd", reference=REFERENCE)
     writer.truth(1, table)
     writer.close()
     written = Trace(tmp_path / "trace.rrd")
-    labels = {
-        name: written.static[f"/truth/{name}/run_01"][0].column("SeriesLines:names").to_pylist()
-        for name in names[:2]
-    }
-    assert labels == {"speed_m_s": [["true"]], "warning_speed_m_s": [["warning"]]}
-    assert f"/truth/{names[2]}/run_01" not in written.static
+    assert list(written.lines("/truth/state/run_01")) == ["position_m", "speed_m_s"]
+    assert list(written.lines("/truth/limits/run_01")) == ["warning_speed_m_s"]
 
 
 def test_a_run_on_its_own_timetable_has_its_own_reference(tmp_path: Path) -> None:
@@ -344,13 +372,13 @@ def test_a_run_on_its_own_timetable_has_its_own_reference(tmp_path: Path) -> Non
     writer.close()
     written = Trace(tmp_path / "trace.rrd")
     for run, reference in ((1, REFERENCE), (2, own)):
-        error = written.values(f"/truth/position_error_m/run_0{run}")[:, 0]
-        assert error.tolist() == (-reference.position_m).tolist()
+        (error,) = written.lines(f"/truth/position_error_m/run_0{run}").values()
+        np.testing.assert_allclose(error, -reference.position_m, rtol=1e-15)
     for field in ("position_m", "speed_m_s", "acceleration_m_s2"):
-        logged = written.values(f"/reference/{field}/run_02")[:, 0]
-        assert logged.tolist() == getattr(own, field).tolist()
-        logged = written.values(f"/reference/{field}")[:, 0]
-        assert logged.tolist() == getattr(REFERENCE, field).tolist()
+        (logged,) = written.lines(f"/reference/{field}/run_02").values()
+        np.testing.assert_allclose(logged, getattr(own, field), rtol=1e-15)
+        (logged,) = written.lines(f"/reference/{field}").values()
+        np.testing.assert_allclose(logged, getattr(REFERENCE, field), rtol=1e-15)
 
 
 def test_a_run_longer_than_the_reference_has_errors_as_far_as_that_goes(tmp_path: Path) -> None:
@@ -358,8 +386,8 @@ def test_a_run_longer_than_the_reference_has_errors_as_far_as_that_goes(tmp_path
     writer.truth(1, np.zeros(TICKS + 5, TRUTH))
     writer.close()
     written = Trace(tmp_path / "trace.rrd")
-    assert len(written.ticks("/truth/position_error_m/run_01")) == TICKS
-    assert len(written.ticks("/truth/position_m/run_01")) == TICKS + 5
+    assert written.ticks("/truth/position_error_m/run_01")[-1] == TICKS - 1
+    assert written.ticks("/truth/state/run_01")[-1] == TICKS + 4
 
 
 def test_summaries_are_on_the_timeline_of_runs(tmp_path: Path) -> None:
@@ -466,7 +494,7 @@ def test_positions_beyond_the_first_sixteen_bits_of_ticks_keep_their_tick(tmp_pa
     writer = open_writer(tmp_path / "trace.rrd")
     writer.frames(1, frames)
     writer.close()
-    assert Trace(tmp_path / "trace.rrd").ticks("/bus/position/run_01") == [70_000]
+    assert Trace(tmp_path / "trace.rrd").ticks("/bus/motion/run_01") == [70_000]
 
 
 def test_the_trains_of_a_line_have_entities_and_references_of_their_own(tmp_path: Path) -> None:
@@ -490,7 +518,7 @@ def test_the_trains_of_a_line_have_entities_and_references_of_their_own(tmp_path
     for train in (0, 1):
         place = f"run_01/train_0{train + 1}"
         np.testing.assert_array_equal(found.frames(f"/bus/frames/{place}"), frames[train])
-        error = found.values(f"/truth/position_error_m/{place}")
+        (error,) = found.lines(f"/truth/position_error_m/{place}").values()
         np.testing.assert_allclose(error, 0.25 * (train + 1), atol=1e-12)
     assert set(found.values("/truth/separation_m/run_01/train_02").ravel()) == {499.75}
     assert "/truth/separation_m/run_01/train_01" not in found.chunks
@@ -538,8 +566,10 @@ def test_speed_and_what_supervises_it_are_drawn_over_position(tmp_path: Path) ->
     drawn = {entity.split("/")[-1] for entity in written.static if "/over_position/" in entity}
     assert drawn >= {"permitted_speed_m_s", "warning_speed_m_s", "speed_m_s", "reference"}
     assert "service_brake_speed_m_s" not in drawn
-    style = written.static["/truth/warning_speed_m_s/run_01"][0]
-    assert style.column("SeriesLines:names").to_pylist() == [["warning"]]
+    assert list(written.lines("/truth/limits/run_01")) == [
+        "permitted_speed_m_s",
+        "warning_speed_m_s",
+    ]
 
 
 def test_the_time_for_a_frame_is_known_after_the_first(tmp_path: Path) -> None:
