@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -57,3 +58,31 @@ def image_command(
 
         image.build(load(scenario), law, boards.board_of(board.value), out)
     say(f"{out}: {boards.BOARDS[board.value].about}")
+
+
+class FmuBus(StrEnum):
+    """How an FMU meets the others."""
+
+    none = "none"
+
+
+def fmu_command(
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario (`ato-hil list`) or a .toml file.")
+    ],
+    out: Annotated[Path, typer.Option(help="FMU to write, NAME.fmu.")],
+    law: Annotated[
+        str | None, typer.Option(help="Control law, or its .py file; the scenario's by default.")
+    ] = None,
+    bus: Annotated[
+        FmuBus, typer.Option(help="none: signals of the frames are variables.")
+    ] = FmuBus.none,
+) -> None:
+    """The controller as an FMU, FMI 3.0 Co-Simulation, with its C and a binary for this machine."""
+    with one_line_for_bad_input():
+        from ato_hil.plant_sim.scenario import load
+        from ato_hil.tools.export.fmu import archive, controller
+
+        made = controller.unpacked(load(scenario), law)
+        missing = archive.write(made, out)
+    say(f"{out}: {len(made.interface.variables)} variables; {missing or 'with a binary'}")

@@ -56,7 +56,11 @@ COMMANDS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("profile", look.profile),
         ("bus-report", buses.bus_report),
     ),
-    "Take away": (("export c", export.c_command), ("export image", export.image_command)),
+    "Take away": (
+        ("export c", export.c_command),
+        ("export image", export.image_command),
+        ("export fmu", export.fmu_command),
+    ),
 }
 GROUPS = {"": app, "export": export.app}  # of commands of two words
 
