@@ -269,7 +269,11 @@ def step(function: Any) -> Any:
         return function
     if numba.config.DISABLE_JIT:
         return _uncompiled(function)
-    compiled = numba.njit(nogil=True, error_model="numpy", boundscheck=False, _nrt=False)(function)
+    # Inlined without asking what it costs: most steps are called from one place, and a call hands
+    # over every array and record field by field.
+    compiled = numba.njit(
+        nogil=True, error_model="numpy", boundscheck=False, forceinline=True, _nrt=False
+    )(function)
     identity = _stable_identity(function)
     compiled._set_uuid(identity)
     compiled._cache = _StepCache(function, identity)
