@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import fcntl
 import hashlib
 import logging
 import os
@@ -28,6 +29,7 @@ from typing import Any
 
 SHARED = "ATO_HIL_CACHE"  # the folder that a parent process has found, for its children
 SUFFIX = ".nbc"
+LOCK = "compiling.lock"
 
 _MAGIC = b"ato-hil compiled step 1\n"
 _DIGEST_BYTES = 16
@@ -132,6 +134,20 @@ def save(path: Path, key: Any, data: bytes) -> None:
             with contextlib.suppress(OSError):
                 os.unlink(temporary)
         _say_unkept(path.parent, error.strerror or str(error))
+
+
+@contextlib.contextmanager
+def alone() -> Iterator[None]:
+    """For one process of those with this folder at a time; where there are no locks, for all."""
+    folder = root()
+    if folder is None:
+        yield
+        return
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(OSError):
+            stream = held.enter_context(open(folder / LOCK, "a"))
+            fcntl.flock(stream, fcntl.LOCK_EX)
+        yield
 
 
 @cache

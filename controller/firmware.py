@@ -12,6 +12,7 @@ stores the learning memory, nothing else.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -600,9 +601,10 @@ def send(params: Record, state: Record, tx: Array) -> None:
     )
 
 
+@cache
 def build_tick(law_step: Any) -> Any:
     """The cyclic task around one law, as a step `tick(params, profile, state, memory, rx, tx,
-    period)`.
+    period)`; made once a process, since loading what was compiled takes longer than a short run.
 
     Shapes: params and state one record of `params_dtype`/`state_dtype`; profile [segments] of
     reference.SEGMENT; memory [2, cells, words]; rx, tx [MESSAGE_COUNT] of codec.MAILBOX.

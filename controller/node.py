@@ -7,6 +7,7 @@ interpreted run (MIL).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,7 @@ def rows(array: np.ndarray) -> Any:
     return array.view(np.recarray) if INTERPRETED else array
 
 
+@cache
 def callable_tick(tick: Any) -> Any:
     """`tick` for Python. Arrays are ten times cheaper to pass than records: a record is described
     field by field."""

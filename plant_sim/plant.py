@@ -8,6 +8,7 @@ code and send the same bits. Every train has mailboxes of its own; a single trai
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -444,10 +445,11 @@ def no_coupler_force_n(train: Any) -> Any:
     return 0.0
 
 
+@cache
 def build(model: Any) -> tuple[Any, Any, Any]:
-    """Steps around one train model, for all trains of the line: `begin(params, state)`,
+    """Steps around one train model, made once a process: `begin(params, state)`,
     `sense(params, limits, state, chance, tick, tx)` and `actuate_and_advance(params, track, state,
-    chance, tick, rx, truth)`.
+    chance, tick, rx, truth)`, for all trains of the line.
 
     Shapes: params, state [trains] of `params_dtype`/`state_dtype`; limits an atp.Limits; track [n]
     of track.SECTION; chance, truth [trains, ticks] of CHANCE, TRUTH; rx, tx [trains, MESSAGE_COUNT]

@@ -302,6 +302,14 @@ def _content(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
     return content
 
 
+def whole(path: Path) -> dict[str, Any]:
+    """What a scenario file states with all that it inherits, and with its cases, so that it stands
+    on no other. Raises ScenarioError."""
+    content = _content(path)
+    content.pop("base", None)
+    return content
+
+
 def _without(path: Path, inherited: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
     """What a base gives, without the keys that `unset` of `content` names."""
     keys = content.get("unset", [])

@@ -1,8 +1,7 @@
 """A sweep: one scenario with numbers varied, the combinations side by side on all cores (SIL).
 
-Each combination is a process of its own; what they compile is compiled once, before. A row of the
-table is the last run of a combination; the plot shows energy against error, and which rows no other
-row beats in both.
+A row of the table is the last run of a combination; the plot shows energy against error, and which
+rows no other row beats in both.
 """
 
 from __future__ import annotations
@@ -10,28 +9,20 @@ from __future__ import annotations
 import csv
 import io
 import itertools
-import multiprocessing
-import os
-import signal
 import tomllib
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ato_hil.can_dbc.child import safe_path
 from ato_hil.can_dbc.errors import InputError
 from ato_hil.controller.registry import law_label
-from ato_hil.plant_sim.scenario import (
-    Loaded,
-    load,
-    overlaid,
-)
-from ato_hil.tools.runs import onboard
+from ato_hil.plant_sim.scenario import Loaded, load
 from ato_hil.tools.runs.files import write_text
-from ato_hil.tools.session import in_process
+from ato_hil.tools.session import job
+from ato_hil.tools.session.job import Job
+from ato_hil.tools.session.spread import Lost, cores, spread
 
 CASE = "case"  # the key that varies the scenario's named case
 LAW = "law."  # short for laws.<the law>.
@@ -52,6 +43,17 @@ class Point:
     law: str
     runs: int
     seed: int
+
+    @property
+    def job(self) -> Job:
+        """The runs of it."""
+        return Job(
+            scenario=self.scenario,
+            overlay=self.overlay,
+            law=self.law,
+            runs=self.runs,
+            seed=self.seed,
+        )
 
 
 def parse_vary(text: str) -> tuple[str, list[Any]]:
@@ -90,68 +92,43 @@ def plan(
         overlay: dict[str, Any] = {}
         for key, value in values.items():
             if key != CASE:
-                _put(overlay, key, chosen, value)
-        loaded = overlaid(name, overlay)
-        onboard.calibration_for(loaded, chosen)
-        points.append(Point(values, name, overlay, chosen, runs or default.runs, seed))
+                try:
+                    put(overlay, key, chosen, value)
+                except SweepError as error:
+                    raise SweepError(f"--vary {error}") from None
+        point = Point(values, name, overlay, chosen, runs or default.runs, seed)
+        job.check(point.job)
+        points.append(point)
     return points
 
 
-def _put(overlay: dict[str, Any], key: str, law: str, value: Any) -> None:
-    """Sets the dotted key of a scenario in nested tables."""
+def put(overlay: dict[str, Any], key: str, law: str, value: Any) -> None:
+    """Sets the dotted key of a scenario in nested tables; `law.` is short for the law's. Raises
+    SweepError."""
     *tables, last = key.removeprefix(LAW).split(".") if key.startswith(LAW) else key.split(".")
     if key.startswith(LAW):
         tables = ["laws", law_label(law), *tables]
     for table in tables:
         overlay = overlay.setdefault(table, {})
         if not isinstance(overlay, dict):
-            raise SweepError(f"--vary {key}: {table!r} is varied as a whole, too")
+            raise SweepError(f"{key}: {table!r} is varied as a whole, too")
     overlay[last] = value
 
 
 def sweep(points: list[Point]) -> Iterator[tuple[int, dict[str, Any]]]:
     """(index of the point, row) of each point as it is done, on all cores."""
-    _compile(points)
-    workers = min(os.cpu_count() or 1, len(points))
-    context = multiprocessing.get_context("spawn")
-    with safe_path():
-        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_interrupts)
-        waiting = {pool.submit(measure, point): index for index, point in enumerate(points)}
-    try:
-        for done in as_completed(waiting):
-            yield waiting[done], done.result()
-    except BrokenProcessPool:
-        raise SweepError("a process of the sweep was killed; nothing was written") from None
-    except BaseException:
-        for child in multiprocessing.active_children():
-            child.terminate()  # they write no file
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _leave_interrupts() -> None:
-    """Ctrl-C is for the process that started this one, which then ends it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _compile(points: list[Point]) -> None:
-    """The steps of every law and train model among the points, so that no two processes compile
-    the same."""
-    seen = set()
-    for point in points:
-        loaded = overlaid(point.scenario, point.overlay)
-        what = (point.law, type(loaded.scenario.train))
-        if what not in seen:
-            seen.add(what)
-            for _run in in_process.runs(loaded, point.law, numbers=range(0)):
-                pass
+    with closing(spread(measure, points, min(cores(), len(points)))) as made:
+        for index, row in made:
+            if isinstance(row, Lost):
+                named = label(points[index].values, list(points[index].values))
+                text = f"{named}: its process was killed {row.attempts} times; nothing was written"
+                raise SweepError(text)
+            yield index, row
 
 
 def measure(point: Point) -> dict[str, Any]:
     """The row of one point: its values, and the metrics of its last run, of a line the worst."""
-    loaded = overlaid(point.scenario, point.overlay)
-    *_, last = in_process.runs(loaded, point.law, point.runs, seed=point.seed)
+    *_, last = job.runs(point.job)
     row = {"run": last.number, **last.metrics}
     row.pop("trains", None)
     faults = (name for names in last.faults for name in names)

@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,7 @@ from ato_hil.controller.interface import (
     FAULT_SPEED_LOST,
 )
 from ato_hil.plant_sim.scenario import Loaded, load
+from ato_hil.tools.campaigns import undetected
 from ato_hil.tools.campaigns.detection import READ, Evidence
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.files import write_json, write_text
@@ -76,6 +78,8 @@ from ato_hil.tools.runs.result import Run
 from ato_hil.tools.session import session
 from ato_hil.tools.session.in_process import runs as runs_in_process
 from ato_hil.tools.session.options import Silent
+from ato_hil.tools.session.processes import RunError
+from ato_hil.tools.session.spread import Lost, cores, spread
 
 SCENARIO = """\
 # A hop between two stops, for `ato-hil threats`.
@@ -159,11 +163,33 @@ class Campaign(msgspec.Struct):
     problems: list[str]
 
 
+class Attack(msgspec.Struct, frozen=True):
+    """What the runs in one process take, as plain data."""
+
+    scenario: str
+    frames: int
+    seed: int
+
+
+class Residual(msgspec.Struct, frozen=True):
+    """What `undetected.measure` takes, likewise."""
+
+    frames: int
+    seed: int
+
+
 def run(
-    frames: int, mode: str, bus: str, seed: int, out: Path, progress: Callable[[str], None]
-) -> Campaign:
-    """The campaign over at least `frames` frames; leaves its scenario, its faults and its table in
-    `out`.
+    *,
+    frames: int,
+    residual_frames: int,
+    mode: str,
+    bus: str,
+    seed: int,
+    out: Path,
+    progress: Callable[[str], None],
+) -> tuple[Campaign, list[undetected.Rate]]:
+    """The campaign over at least `frames` frames, and beside it how many of `residual_frames`
+    corrupt ones nobody can notice; leaves its scenario, its faults and its table in `out`.
 
     :param mode: sil or hil.
     :param progress: hears how far it is.
@@ -177,7 +203,14 @@ def run(
     plan = plan_of(listed, seed, loaded.scenario.period_s)
     file = out / "faults.toml"
     write_text(file, as_toml(plan))
-    campaign, events = in_process(loaded, listed, plan, progress)
+    progress(f"{listed[-1].runs.stop - 1} runs, and corrupt frames")
+    tasks = [Attack(str(scenario), frames, seed), Residual(residual_frames, seed)]
+    with closing(spread(measure, tasks, min(cores(), len(tasks)))) as made:
+        found = dict(made)
+    for result in found.values():
+        if isinstance(result, Lost):
+            raise RunError(f"a process of the campaign was killed {result.attempts} times")
+    campaign, events = found[0]
     campaign.mode = mode
     if mode == "hil":
         runs = listed[-1].runs.stop - 1
@@ -193,7 +226,17 @@ def run(
         if injected != session.log_of(events):
             campaign.problems.append("on the bus other faults were injected than in one process")
     write_json(out / "threats.json", {"schema": 1, **msgspec.to_builtins(campaign)})
-    return campaign
+    return campaign, found[1]
+
+
+def measure(task: Attack | Residual) -> Any:
+    """What comes of a task: of the runs, as `in_process`."""
+    if isinstance(task, Residual):
+        return undetected.measure(task.frames, task.seed)
+    loaded = load(task.scenario)
+    listed = numbered(threats(), task.frames, loaded.ticks)
+    plan = plan_of(listed, task.seed, loaded.scenario.period_s)
+    return in_process(loaded, listed, plan)
 
 
 class _Progress(Silent):
@@ -301,9 +344,7 @@ def as_toml(plan: Plan) -> str:
     return "".join(f"[[bus]]\n{table}\n\n" for table in tables)
 
 
-def in_process(
-    loaded: Loaded, listed: list[Numbered], plan: Plan, progress: Callable[[str], None]
-) -> tuple[Campaign, list[Event]]:
+def in_process(loaded: Loaded, listed: list[Numbered], plan: Plan) -> tuple[Campaign, list[Event]]:
     """All runs in one process: the campaign with a row for each threat, and all injected faults."""
     calibration = onboard.calibration_for(loaded, loaded.scenario.law)
     bounds = reaction_ticks(calibration.params[0]["guard"])
@@ -332,7 +373,6 @@ def in_process(
         else:
             row.bound = NOTICE_TICKS
             reactions[row.threat] += noticed
-        progress(f"run {run.number} of {all_runs[-1]}")
     for each in listed:
         _conclude(found[each.threat.name], each.threat, reactions[each.threat.name])
     rows = list(found.values())

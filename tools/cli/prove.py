@@ -42,7 +42,7 @@ def claims(
     import pkgutil
 
     from ato_hil.tools import papers
-    from ato_hil.tools.papers.claims import evaluate
+    from ato_hil.tools.papers.claims import evaluate_all
     from ato_hil.tools.runs import files
 
     known = sorted(module.name for module in pkgutil.iter_modules(papers.__path__) if module.ispkg)
@@ -52,11 +52,8 @@ def claims(
         raise fail(f"{json_file}: no such folder", EXIT_BAD_INPUT)
     claimed = papers.part(paper, "claims").CLAIMS
     say(f"{len(claimed)} claims, measured on whole runs: this takes minutes", "dim")
-    rows = []
     with one_line_for_bad_input(), working("") as update:
-        for number, claim in enumerate(claimed, start=1):
-            update(f"{number} of {len(claimed)}: {claim.text}")
-            rows.append(evaluate(claim))
+        rows = evaluate_all(list(claimed), update)
     lines = [
         Row(
             (
@@ -150,7 +147,6 @@ def threats(
     """Attack a run with every threat of EN 50159, and say what was noticed, how soon, and what
     came of it."""
     from ato_hil.tools.campaigns import threats as campaign
-    from ato_hil.tools.campaigns import undetected
     from ato_hil.tools.runs import locks
     from ato_hil.tools.session.processes import RunError
 
@@ -167,8 +163,15 @@ def threats(
             locks.folder_held(place.work),
             working("compiling ...") as update,
         ):
-            rates = undetected.measure(RESIDUAL_FRAMES, seed)
-            found = campaign.run(least, mode.value, bus, seed, place.work, update)
+            found, rates = campaign.run(
+                frames=least,
+                residual_frames=RESIDUAL_FRAMES,
+                mode=mode.value,
+                bus=bus,
+                seed=seed,
+                out=place.work,
+                progress=update,
+            )
     except RunError as error:
         raise fail(str(error), EXIT_ENDED_EARLY) from None
     _print_threats(found)

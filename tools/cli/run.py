@@ -23,7 +23,6 @@ from ato_hil.tools.cli.console import (
     say,
     say_if_compiling,
 )
-from ato_hil.tools.cli.expect import Expectation, check_keys, parse, unmet
 from ato_hil.tools.cli.options import (
     DEFAULT_BOARD,
     BoardName,
@@ -38,6 +37,7 @@ from ato_hil.tools.cli.options import (
 )
 from ato_hil.tools.cli.output import console
 from ato_hil.tools.cli.tables import Column, Row, show
+from ato_hil.tools.runs.expect import Expectation, check_keys, parse, unmet
 from ato_hil.tools.session import boards
 from ato_hil.tools.trace.live_viewer import LiveView
 

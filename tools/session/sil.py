@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ def clear(mailboxes: Any) -> None:
         mailboxes[i].fresh = 0
 
 
+@lru_cache(maxsize=16)  # an interpreted one that is watched is another each time
 def build_loop(controller_tick: Any, sense: Any, actuate_and_advance: Any) -> Any:
     """Loop over `ticks` control periods of the plant and the controllers of all its trains; leaves
     the number of frames logged of each train in `counts`."""

@@ -41,7 +41,7 @@ def attack(scenario, tmp_path: Path):
     def run(*listed: Threat, seed: int = 1) -> dict[str, Row]:
         with_runs = threats.numbered(list(listed), 1, TICKS)
         plan = threats.plan_of(with_runs, seed, 0.01)
-        campaign, _ = threats.in_process(scenario, with_runs, plan, lambda text: None)
+        campaign, _ = threats.in_process(scenario, with_runs, plan)
         assert campaign.frames == sum(row.frames for row in campaign.rows)
         return {row.threat: row for row in campaign.rows}
 

@@ -10,9 +10,10 @@ from rich.console import Console
 
 from ato_hil.can_dbc import step
 from ato_hil.plant_sim.scenario import load
-from ato_hil.tools.cli import console, expect, run
-from ato_hil.tools.cli.expect import ExpectError, parse, unmet
+from ato_hil.tools.cli import console, run
 from ato_hil.tools.cli.options import Mode
+from ato_hil.tools.runs import expect
+from ato_hil.tools.runs.expect import ExpectError, parse, unmet
 from ato_hil.tools.session import sil
 
 ROW = {"run": 2, "max_position_error_m": 0.01, "stop_error_m": None, "faults": ["overspeed"]}

@@ -6,7 +6,6 @@ ten runs over run 1. Ideal plant: no delay, lag, noise or grid of the sensors.
 
 from __future__ import annotations
 
-from functools import cache
 from math import inf
 
 import msgspec
@@ -15,7 +14,7 @@ import numpy as np
 from ato_hil.controller.laws.afilc import Gains
 from ato_hil.plant_sim.scenario import Loaded, at_rate, load
 from ato_hil.plant_sim.trains import point
-from ato_hil.tools.papers.claims import Claim, variant
+from ato_hil.tools.papers.claims import Claim, measured, variant
 from ato_hil.tools.runs.frames import commanded_force_n, timetable_rate
 from ato_hil.tools.runs.result import Run
 from ato_hil.tools.session import in_process
@@ -141,7 +140,7 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values * values)))
 
 
-@cache
+@measured
 def of(base: str, text: str = "", law: str = "afilc", count: int = RUNS) -> np.ndarray:
     """Runs of a scenario, or of one that stands on it with `text` replaced."""
     return history(variant(base, text) if text else load(base), law, count)

@@ -8,7 +8,6 @@ train's own timetable, the worst train's unless said otherwise. T1 leads.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
 from math import inf
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ato_hil.plant_sim.scenario import load, members
-from ato_hil.tools.papers.claims import Claim, variant
+from ato_hil.tools.papers.claims import Claim, measured, variant
 from ato_hil.tools.session import in_process
 
 POC, SVL, PID = "mtcc", "mtcc-single", "mtcc-pid"
@@ -98,7 +97,7 @@ class Run:
         return [train["max_speed_error_m_s"] for train in self.row["trains"]]
 
 
-@cache
+@measured
 def run(base: str, text: str = "", law: str | None = None, seed: int = 1) -> Run:
     """One run of a line (SIL) with `text` on top."""
     loaded = variant(base, text) if text else load(base)

@@ -1,4 +1,5 @@
-"""What a user expects of a run's row, as `--expect "max_position_error_m < 0.02"`."""
+"""What a user expects of a run's row, as `--expect "max_position_error_m < 0.02"`: a key, how it
+compares, a number. Of `|stop_error_m|` the size counts, either way."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ato_hil.can_dbc.errors import InputError, expected
 
-OPERATORS: dict[str, Callable[[float, float], bool]] = {
+OPERATORS: dict[str, Callable[[Any, float], Any]] = {
     "<": operator.lt,
     "<=": operator.le,
     ">": operator.gt,
@@ -17,7 +18,7 @@ OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "==": operator.eq,
     "!=": operator.ne,
 }
-WRITTEN = re.compile(r"\s*(\w+)\s*(<=|>=|==|!=|<|>)\s*(\S+)\s*")
+WRITTEN = re.compile(r"\s*(\w+|\|\s*\w+\s*\|)\s*(<=|>=|==|!=|<|>)\s*(\S+)\s*")
 
 
 class ExpectError(InputError):
@@ -30,20 +31,27 @@ class Expectation(NamedTuple):
     key: str
     operator: str
     bound: float
+    size: bool = False  # of the value, without its sign
 
     def __str__(self) -> str:
-        return f"{self.key} {self.operator} {self.bound:g}"
+        key = f"|{self.key}|" if self.size else self.key
+        return f"{key} {self.operator} {self.bound:g}"
+
+    def holds(self, value: Any) -> Any:
+        """Whether a value, or each of an array, is as expected."""
+        return OPERATORS[self.operator](abs(value) if self.size else value, self.bound)
 
 
-def parse(text: str) -> Expectation:
-    """Raises ExpectError."""
+def parse(text: str, where: str = "--expect") -> Expectation:
+    """Raises ExpectError, which names `where` it is written."""
     found = WRITTEN.fullmatch(text)
     try:
         if found is not None:
-            return Expectation(found[1], found[2], float(found[3]))
+            key = found[1].strip("| ")
+            return Expectation(key, found[2], float(found[3]), found[1].startswith("|"))
     except ValueError:
         pass
-    raise ExpectError(f'--expect {text!r}: expected KEY < NUMBER, such as "stop_error_m < 0.3"')
+    raise ExpectError(f'{where} {text!r}: expected KEY < NUMBER, such as "stop_error_m < 0.3"')
 
 
 def check_keys(expectations: list[Expectation], row: dict[str, Any]) -> None:
@@ -62,7 +70,7 @@ def unmet(expectations: list[Expectation], row: dict[str, Any]) -> list[str]:
         value = _number(row[each.key])
         if value is None:
             found.append(f"{each}: it has no value")
-        elif not OPERATORS[each.operator](value, each.bound):
+        elif not each.holds(value):
             found.append(f"{each}: it is {value:.6g}")
     return found
 
