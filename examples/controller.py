@@ -22,7 +22,7 @@ PERIOD_S = 0.01
 def serve(link: Link, given: argparse.Namespace) -> None:
     """Answers the plant's frames."""
     profile = read_profile(given.profile)
-    state, iteration, tick, integral = "idle", 0, 0, 0.0
+    state, iteration, tick, status_tick, integral = "idle", 0, 0, 0, 0.0
     heard: dict[str, dict[str, Any]] = {}  # since the last tick
     while True:
         name, signals = link.receive(None)
@@ -30,23 +30,29 @@ def serve(link: Link, given: argparse.Namespace) -> None:
         if name == "RUN_CTRL" and signals["RunState"] != "running":
             state, iteration = str(signals["RunState"]), signals["Iteration"]
             if state == "armed":
-                tick, integral = 0, 0.0
+                tick, status_tick, integral = 0, 0, 0.0
                 link.restart()
             send_status(link, state, iteration)
         elif name == "RUN_CTRL" and state == "armed":
             state = "running"
         elif name == "TRAIN_POSITION" and state == "running":
+            # The plant counts. Here ticks are only made whole: in real time some may not have come.
+            ahead = (signals["Tick"] - tick) % 65536
+            if ahead >= 32768:
+                continue  # of a tick that is past
+            tick += ahead
             want, error = profile[min(tick, len(profile) - 1)], 0.0
             acceleration = -FORCE_MAX_M_S2  # unless all that the law needs has come
-            if {"ATP_LIMIT", "TRAIN_SPEED"} <= set(heard) and signals["Tick"] == tick % 65536:
+            if {"ATP_LIMIT", "TRAIN_SPEED"} <= set(heard):
                 limit, speed = heard["ATP_LIMIT"], heard["TRAIN_SPEED"]["Speed"]
                 error = want["position_m"] - signals["Position"]
                 pid = KP * error + KI * integral + KD * (want["speed_m_s"] - speed)
                 acceleration = allowed(pid + want["acceleration_m_s2"], limit, speed)
             if abs(acceleration) < FORCE_MAX_M_S2:
                 integral += error * PERIOD_S
-            if tick % 10 == 0:
+            if tick >= status_tick:
                 send_status(link, state, iteration)
+                status_tick = tick + 10
             send_force(link, acceleration * given.mass, given.cars, tick)
             tick, heard = tick + 1, {}
 

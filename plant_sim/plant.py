@@ -71,6 +71,7 @@ TRUTH = np.dtype(
         ("braking_j", np.float64),  # work taken up by braking, likewise
         ("recuperated_j", np.float64),  # what of it came back
         ("coupler_force_n", np.float64),  # largest of any coupler over tick k; 0 for rigid trains
+        ("command_age_ticks", np.float64),  # of the command that acts
         *((name, np.float64) for name in ATP_COLUMNS),
     ]
 )
@@ -105,7 +106,7 @@ NODE_PARAMS = np.dtype(
         ("brake_to", np.int64),
         ("brake_m_s2", np.float64),  # deceleration that it holds
         ("brake_supervision", np.int64),  # what ATP says meanwhile
-        ("command_age_max", np.int64),  # ticks without a valid command until the vehicle brakes
+        ("command_age_max", np.int64),  # ticks; with an older command the vehicle brakes
     ],
     align=True,
 )
@@ -122,7 +123,7 @@ NODE_STATE = np.dtype(
             np.float64,
             (CARS_MAX,),
         ),  # last valid command: channel 0 the total, or each car
-        ("command_age", np.int64),  # ticks since all of the command was last valid
+        ("command_age", np.int64),  # ticks since that which all of the command was last valid for
         ("mode", np.int64),  # of the last valid FORCE_CMD
         ("emergency_requested", np.int64),  # 1: by the controller, until standstill
         ("refused", np.int64),  # frames that failed the end-to-end check
@@ -235,12 +236,23 @@ def raw_below(signal: Any, value: Any) -> Any:
 
 
 @step
+def command_age(tick: Any, echo: Any) -> Any:
+    """How many ticks ago that was which a command echoes, modulo 65536; 0 for one that is to come:
+    in real time a controller goes on without a plant that is held up."""
+    behind = (tick - echo) & TICK_MASK
+    return behind if behind <= TICK_MASK // 2 else int64(0)
+
+
+@step
 def read_commands(params: Any, node: Any, rx: Any) -> None:
     """command_n and mode from the frames that pass their check; a missing or refused one keeps the
-    last value, and the command grows old."""
+    last value, and the command grows old. One for a tick long past is as good as missing."""
     complete = received(node, rx, FORCE_CMD)
+    word = int64(rx[FORCE_CMD.index].payload)
+    age = command_age(int64(node.tick), get(word, FORCE_CMD.Tick))
+    if age > params.command_age_max:
+        complete = int64(0)
     if complete:
-        word = int64(rx[FORCE_CMD.index].payload)
         node.mode = get(word, FORCE_CMD.Mode)
         if params.cars == 0:
             node.command_n[0] = get(word, FORCE_CMD.Force) * FORCE_CMD.Force.scale
@@ -252,7 +264,7 @@ def read_commands(params: Any, node: Any, rx: Any) -> None:
         complete &= read_cars(node, rx, int64(4), CAR_FORCE_3, CAR_FORCE_3.Car5, CAR_FORCE_3.Car6)
     if params.cars > 6:
         complete &= read_cars(node, rx, int64(6), CAR_FORCE_4, CAR_FORCE_4.Car7, CAR_FORCE_4.Car8)
-    node.command_age = 0 if complete else node.command_age + 1
+    node.command_age = age if complete else node.command_age + 1
 
 
 @step
@@ -416,6 +428,7 @@ def read_train(params: Any, state: Any, rx: Any, truth: Any) -> None:
     truth.braking_j = train.braking_j
     truth.recuperated_j = params.node.recuperation * train.braking_j
     read_commands(params.node, node, rx)
+    truth.command_age_ticks = node.command_age * 1.0
     radio.read(node, state.radio, rx)
     fail(params.node, node, train)
     failures.weaken(params.failures, state.failures, node)

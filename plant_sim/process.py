@@ -205,13 +205,23 @@ def answer(
 class Heard:
     """What a train's controller was last heard to say."""
 
-    at_ns: int
+    at_ns: int  # when, but for commands that are too old to act
+    age_max: int  # ticks: older ones are
     echo: int = -1  # FORCE_CMD.Tick
+    too_old: int = 0  # commands since then
 
     def answers(self, tick: int) -> bool:
         """Whether that was the command for this tick, or a newer one: of a controller that has gone
         on without the plant."""
         return (self.echo - tick) & plant.TICK_MASK <= plant.TICK_MASK // 2
+
+    def take(self, echo: int, tick: int) -> None:
+        """A command has come in this tick."""
+        self.echo = echo
+        if plant.command_age(tick, echo) <= self.age_max:
+            self.at_ns, self.too_old = pace.now_ns(), 0
+        else:
+            self.too_old += 1
 
 
 def drive_in_real_time(
@@ -236,7 +246,9 @@ def drive_in_real_time(
     for port in ports:
         port.inbox.begin_run(run)
     deadline_ns = pace.now_ns() + period_ns
-    heard = [Heard(deadline_ns) for _ in ports]
+    heard = [
+        Heard(deadline_ns, member.scenario.atp.command_age_max_ticks) for member in here.members
+    ]
     next_progress_ns = 0
     for tick in range(truth.shape[1]):
         woke_ns = pace.wait_until(deadline_ns, spin_ns)
@@ -249,7 +261,7 @@ def drive_in_real_time(
                 post(here, train, port.bus)
             await_commands(ports, heard, tick, deadline_ns)
         for port, of_train in zip(ports, heard, strict=True):
-            listen(port, of_train, 0.0)
+            listen(port, of_train, tick, 0.0)
             port.inbox.close_tick()
         began_ns = pace.now_ns()
         answered = all(of_train.answers(tick) for of_train in heard)
@@ -261,6 +273,12 @@ def drive_in_real_time(
         for train, of_train in enumerate(heard):
             if now_ns - of_train.at_ns > timeout_s * 1e9:
                 awaited = f"FORCE_CMD up to tick {tick} of run {run}"
+                if of_train.too_old:
+                    name = controller_name(here, train)
+                    raise SilentNode(
+                        f"{name} is behind: in tick {tick} of run {run} its FORCE_CMD are for"
+                        f" tick {of_train.echo}, and so late for {timeout_s:g} s"
+                    )
                 raise silence(here, train, ports[train].bus, awaited, timeout_s)
         if stop.requested:
             raise Stopped
@@ -280,15 +298,14 @@ def await_commands(ports: list[Port], heard: list[Heard], tick: int, deadline_ns
             if left_ns <= 0:
                 pace.wait_until(deadline_ns)
                 return
-            listen(port, of_train, left_ns * 1e-9)
+            listen(port, of_train, tick, left_ns * 1e-9)
 
 
-def listen(port: Port, heard: Heard, timeout_s: float) -> None:
-    """Takes what comes from a train's bus, or waits for the first of it."""
+def listen(port: Port, heard: Heard, tick: int, timeout_s: float) -> None:
+    """Takes what comes from a train's bus in a tick, or waits for the first of it."""
     for frame_id, payload in collect(port, timeout_s):
         if frame_id == FORCE_CMD.frame_id and intact(FORCE_CMD, payload):
-            heard.at_ns = pace.now_ns()
-            heard.echo = (payload >> TICK_START) & plant.TICK_MASK
+            heard.take((payload >> TICK_START) & plant.TICK_MASK, tick)
 
 
 def echoes(tick: int, frame_id: int, payload: int) -> bool:

@@ -61,7 +61,10 @@ class Rig:
         return get(int(box["payload"]), layout) * layout.scale if box["fresh"] else None
 
     def receive(self, message, flip=0, counter=None, **signals):
-        """Puts a protected frame into the plant's mailbox; `flip` damages it."""
+        """Puts a protected frame into the plant's mailbox; `flip` damages it. A command is for the
+        tick that it comes in, unless the test says otherwise."""
+        if message is FORCE_CMD:
+            signals = {"Tick": int(self.node["tick"]) & plant.TICK_MASK, **signals}
         word = sum(
             put(getattr(message, name), round(value / getattr(message, name).scale))
             for name, value in signals.items()
@@ -269,6 +272,22 @@ def test_the_vehicle_brakes_when_commands_stay_away():
     assert max(lost[age_max + cut_off :]) < 0
     assert lost[-1] == pytest.approx(-0.8 * 194295.0)
     assert set(full(rig, 3)) == {1e5}  # a command comes again
+
+
+def test_a_command_for_a_tick_long_past_is_as_bad_as_none():
+    rig = Rig()
+    age_max = int(rig.here.params["node"]["command_age_max"][0])
+    ages = []
+    for tick in range(age_max + 2):
+        rig.receive(FORCE_CMD, Force=1000.0 * tick, Tick=0)
+        ages.append(float(rig.advance()["command_age_ticks"]))
+    assert ages == list(range(age_max + 2))
+    assert rig.node["command_n"][0] == 1000.0 * age_max  # the last one was not taken
+    rig.receive(FORCE_CMD, Force=1e5)
+    assert rig.advance()["command_age_ticks"] == 0
+    rig.receive(FORCE_CMD, Force=2e5, Tick=age_max + 9)  # of a controller that has gone on alone
+    assert rig.advance()["command_age_ticks"] == 0
+    assert rig.node["command_n"][0] == 2e5
 
 
 def test_a_car_without_commands_is_as_bad_as_none():

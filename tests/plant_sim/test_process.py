@@ -54,6 +54,7 @@ class Bus:
 
     clock: Clock
     after_ns: dict[int, int | None] = field(default_factory=dict)  # by tick; else 1 ms
+    echoes: dict[int, int] = field(default_factory=dict)  # by tick, where it is another
     sent: list[tuple[int, int]] = field(default_factory=list)  # tick and time of each measurement
     pace_bits: set[int] = field(default_factory=set)
     answers: list[tuple[int, tuple[int, int]]] = field(default_factory=list)
@@ -69,7 +70,8 @@ class Bus:
             self.sent.append((tick, self.clock.now))
             after_ns = self.after_ns.get(tick, 1_000_000)
             if after_ns is not None:
-                word = put(FORCE_CMD.Tick, tick) + put(FORCE_CMD.Force, 1000 * (tick + 1))
+                echo = self.echoes.get(tick, tick)
+                word = put(FORCE_CMD.Tick, echo) + put(FORCE_CMD.Force, 1000 * (tick + 1))
                 frame = (
                     FORCE_CMD.frame_id,
                     int(e2e.protect(word, self.counter, FORCE_CMD.data_id)),
@@ -194,5 +196,20 @@ def test_a_hub_that_says_nothing_is_named_instead(clock):
     ("echo", "answered"), [(-1, False), (9, False), (10, True), (12, True), (65_535, False)]
 )
 def test_a_controller_that_has_gone_on_alone_has_answered(echo, answered):
-    assert process.Heard(0, echo).answers(10) == answered
-    assert process.Heard(0, echo & 0xFFFF).answers(10 + 65_536) == answered
+    assert process.Heard(0, 30, echo).answers(10) == answered
+    assert process.Heard(0, 30, echo & 0xFFFF).answers(10 + 65_536) == answered
+
+
+def test_commands_for_ticks_long_past_end_the_run_as_silence_does(clock):
+    """A controller that has missed ticks and goes on counting by itself."""
+    here = built()
+    age_max = here.members[0].scenario.atp.command_age_max_ticks
+    allowed = Bus(clock, echoes={tick: max(tick - age_max, 0) for tick in range(TICKS)})
+    truth, timing, _begin_ns = drive(clock, allowed, timeout_s=0.1)
+    assert (timing["latency_ns"][1:] == pace.NO_COMMAND).all()
+    assert (truth["command_age_ticks"] == np.minimum(np.arange(TICKS), age_max)).all()
+    bus = Bus(clock, echoes=dict.fromkeys(range(10, TICKS), 65_500))
+    says = r"controller is behind: in tick \d+ of run 1 its FORCE_CMD are for tick 65500"
+    with pytest.raises(process.SilentNode, match=says):
+        drive(clock, bus, timeout_s=0.1)
+    assert len(bus.sent) == 20

@@ -15,6 +15,7 @@ from ato_hil.tools.cli.output import console, errors
 EXIT_BAD_INPUT = 1
 EXIT_ENDED_EARLY = 3  # a session, or a recording
 EXIT_NOT_AS_EXPECTED = 4
+EXIT_NOT_CONTROLLED = 5
 EXIT_INTERRUPTED = 130
 
 

@@ -30,6 +30,7 @@ from ato_hil.tools.cli.console import (
     EXIT_ENDED_EARLY,
     EXIT_INTERRUPTED,
     EXIT_NOT_AS_EXPECTED,
+    EXIT_NOT_CONTROLLED,
 )
 from ato_hil.tools.cli.main import COMMANDS, app
 from ato_hil.tools.runs.files import write_text
@@ -58,6 +59,8 @@ EXIT_STATUS = f"""Exit status:
 | 2 | a command, option or value that the command line does not have |
 | {EXIT_ENDED_EARLY} | a run ended early: a node or the bus is gone; the runs before it are kept |
 | {EXIT_NOT_AS_EXPECTED} | `run --expect`: the last run is otherwise |
+| {EXIT_NOT_CONTROLLED} | `run`: a train was without a command for so long that its vehicle \
+braked (fault `not_controlled`), and no `--faults` had asked for that |
 | {EXIT_INTERRUPTED} | Ctrl-C or SIGTERM; what was finished is kept |
 
 Results are never replaced without a word. Without `--out` a session gets a folder of its own:

@@ -18,6 +18,7 @@ from ato_hil.tools.cli.console import (
     EXIT_ENDED_EARLY,
     EXIT_INTERRUPTED,
     EXIT_NOT_AS_EXPECTED,
+    EXIT_NOT_CONTROLLED,
     fail,
     one_line_for_bad_input,
     say,
@@ -274,6 +275,8 @@ def run(
         _print_end(summary, replace(options, out=place.final, record=record))
         otherwise = unmet(expected, summary["runs"][-1])
         failure = fail("; ".join(otherwise), EXIT_NOT_AS_EXPECTED) if otherwise else None
+        if faults is None and (alone := _not_controlled(summary)):
+            failure = fail(alone, EXIT_NOT_CONTROLLED)
         _wait_for(viewer)
         if failure is not None:
             raise failure
@@ -338,6 +341,21 @@ def _print_end(summary: dict[str, Any], options: Options) -> None:
         say(f"faults  {log}   (injected: {injected or 'none'})")
     if options.record is not None:
         say(f"record  {options.record}   (again: ato-hil replay {options.record})")
+
+
+def _not_controlled(summary: dict[str, Any]) -> str:
+    """Which runs no controller drove for a while, in a line; empty if there are none."""
+    runs = [
+        str(row["run"])
+        for row in summary["runs"]
+        if any(name.endswith("not_controlled") for name in row["faults"])
+    ]
+    if not runs:
+        return ""
+    return (
+        f"not controlled in run {', '.join(runs)}: commands were missing or stale for longer than"
+        " atp.command_age_max_ticks, so the vehicle braked"
+    )
 
 
 def _wait_for(viewer: LiveView | None) -> None:

@@ -84,12 +84,16 @@ class Run:
 
     @property
     def row(self) -> dict[str, Any]:
-        """The row of summary.json. Its faults are those that the controller has seen, and trains
-        that came too near to each other or too far apart."""
+        """The row of summary.json. Its faults are those that the controller has seen, trains that
+        nobody controlled, and trains that came too near to each other or too far apart."""
         if self.recorded is not None:
             return self.recorded
         strayed = summary_row.separation_faults(self.members, self.law, self.metrics)
-        faults = [[*ours, *more] for ours, more in zip(self.faults, strayed, strict=True)]
+        alone = summary_row.control_faults(self.members, self.truths)
+        faults = [
+            [*of_train, *left, *more]
+            for of_train, left, more in zip(self.faults, alone, strayed, strict=True)
+        ]
         row = {
             "run": self.number,
             **self.metrics,

@@ -48,6 +48,17 @@ def run_row(
     return worst
 
 
+def control_faults(members: list[Loaded], truths: list[np.ndarray]) -> list[list[str]]:
+    """`not_controlled` for each train that had no command of use for longer than its vehicle bears
+    (`atp.command_age_max_ticks`): it braked by itself. Not known of a plant that is not ours."""
+    return [
+        ["not_controlled"]
+        if (truth["command_age_ticks"] > member.scenario.atp.command_age_max_ticks).any()
+        else []
+        for member, truth in zip(members, truths, strict=True)
+    ]
+
+
 def separation_faults(members: list[Loaded], law: str, row: dict[str, Any]) -> list[list[str]]:
     """What each train's distance from the one ahead did that it must not: `separation` where it
     left (l1, l2), as `control.rebasing` or the gains of the law have them."""

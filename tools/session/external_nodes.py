@@ -250,7 +250,10 @@ def measured_truth(frames: np.ndarray, ticks: int, period_s: float) -> np.ndarra
     """What the bus shows of a foreign plant, [ticks] of plant.TRUTH, from the FRAME rows of a run:
     measured instead of true state, the force and the energy that were commanded."""
     truth = np.zeros(ticks, TRUTH)
-    for name in ATP_COLUMNS:  # what a foreign ATP would do is not on the bus
+    for name in (
+        *ATP_COLUMNS,
+        "command_age_ticks",
+    ):  # none of that is on the bus
         truth[name] = np.nan
     truth["position_m"] = held(frames, ticks, TRAIN_POSITION, "Position")
     truth["speed_m_s"] = held(frames, ticks, TRAIN_SPEED, "Speed")

@@ -11,7 +11,7 @@ from ato_hil.plant_sim.scenario import load, members, overlaid
 from ato_hil.tools.runs.files import write_json
 from ato_hil.tools.runs.metrics import run_metrics, supervision
 from ato_hil.tools.runs.onboard import error_weight
-from ato_hil.tools.runs.summary_row import separation_faults
+from ato_hil.tools.runs.summary_row import control_faults, separation_faults
 
 
 def test_interventions_and_the_largest_speeds_above_the_curves():
@@ -109,3 +109,15 @@ def test_a_separation_outside_its_bounds_is_a_fault_of_the_train_behind():
     found = separation_faults(trains, "mtcc", {"trains": rows})
     assert found == [[], [], ["separation"], ["separation"]]
     assert separation_faults(members(load("subway")), "cailc", {}) == [[]]
+
+
+def test_a_train_that_nobody_controlled_for_a_while_is_a_fault():
+    trains = members(load("subway"))
+    age_max = trains[0].scenario.atp.command_age_max_ticks
+    truth = np.zeros(5, TRUTH)
+    truth["command_age_ticks"] = np.nan  # of a plant that is not ours
+    assert control_faults(trains, [truth]) == [[]]
+    truth["command_age_ticks"][1:3] = age_max, 0
+    assert control_faults(trains, [truth]) == [[]]
+    truth["command_age_ticks"][2] = age_max + 1
+    assert control_faults(trains, [truth]) == [["not_controlled"]]
