@@ -14,6 +14,7 @@ from ato_hil.tools.cli.console import (
     fail,
     one_line_for_bad_input,
     say,
+    working,
 )
 from ato_hil.tools.cli.options import SEED_MAX, Picture, ScenarioName
 from ato_hil.tools.cli.output import console
@@ -113,6 +114,24 @@ def view(
             else:
                 if status:
                     raise fail(f"the viewer ended with exit status {status}", EXIT_BAD_INPUT)
+
+
+def table(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of `ato-hil run`.")],
+    out: Annotated[Path, typer.Option(help="Table to write: X.csv or X.parquet.")],
+) -> None:
+    """Write a session as a table, a row for each tick: bus, true state, reference; units in the
+    names."""
+    with one_line_for_bad_input():
+        from ato_hil.tools.runs import by_tick
+        from ato_hil.tools.runs.folder import read
+
+        with working(f"reading {folder} ...") as update:
+            rows, columns = by_tick.write(
+                *(read(folder), out),
+                lambda done, of: update(f"{done} of {of} runs written"),
+            )
+    say(f"{out}: {rows} rows, {columns} columns")
 
 
 def figures(

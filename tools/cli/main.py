@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("view", look.view),
         ("figures", look.figures),
         ("report", look.report),
+        ("table", look.table),
         ("list", look.list_scenarios),
         ("show", scenarios.show),
         ("new", scenarios.new),
