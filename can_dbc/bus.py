@@ -94,11 +94,20 @@ def open_bus(name: str, **kwargs: Any) -> can.BusABC:
     try:
         if own := _OPEN.get(choice.interface):
             return own(choice.channel, **kwargs)
-        # Without ignore_config, ~/.canrc or ./can.ini could put us on another bus.
-        return can.Bus(choice.channel, choice.interface, ignore_config=True, **kwargs)
+        return can.Bus(ignore_config=True, **_configured(choice, kwargs))
     except Exception as error:  # vendors' drivers raise what they like
         reason = " ".join(str(error).split()) or type(error).__name__
         raise BusError(f"bus {name!r}: cannot open {choice.name}: {reason}") from error
+
+
+def _configured(choice: BusChoice, given: dict[str, Any]) -> dict[str, Any]:
+    """Settings of an adapter, such as its bitrate: those given, then those of python-can's can.conf
+    where that is about this adapter. It never puts us on another bus."""
+    asked = {"interface": choice.interface, "channel": choice.channel}
+    of_file = can.util.load_file_config()
+    if any(of_file.get(key, value) != value for key, value in asked.items()):
+        return {**asked, **given}
+    return dict(can.util.load_config(config={**asked, **given}))
 
 
 def choose_bus(name: str) -> BusChoice:

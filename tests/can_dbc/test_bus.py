@@ -280,6 +280,28 @@ def test_configuration_files_do_not_count(monkeypatch, tmp_path):
         assert recv_frames(bus, 0) == []
 
 
+@pytest.mark.parametrize(
+    ("text", "bitrate"),
+    [
+        ("interface = virtual\nchannel = wire\nbitrate = 250000", 250_000),
+        ("bitrate = 125000", 125_000),
+        ("interface = slcan\nchannel = wire\nbitrate = 250000", None),
+        ("interface = virtual\nchannel = other\nbitrate = 250000", None),
+    ],
+)
+def test_can_conf_sets_up_the_adapter_that_it_names(monkeypatch, tmp_path, text, bitrate):
+    (tmp_path / "can.conf").write_text(f"[default]\n{text}\n")
+    monkeypatch.setattr(can.util, "CONFIG_FILES", [str(tmp_path / "can.conf")])
+    given = []
+    monkeypatch.setattr(can, "Bus", lambda **settings: given.append(settings))
+    open_bus("virtual:wire", fd=True)
+    open_bus("virtual:wire", bitrate=1_000_000)
+    assert [each.get("bitrate") for each in given] == [bitrate, 1_000_000]
+    for each in given:
+        assert (each["interface"], each["channel"]) == ("virtual", "wire")
+    assert given[0]["fd"] is True
+
+
 def test_a_name_too_long_for_an_interface():
     assert socketcan_reason("x" * 40)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -80,6 +81,44 @@ def decode(
         say(note, "dim")
     if done.missing:
         raise fail(f"{recording}: {done.missing}", EXIT_ENDED_EARLY)
+
+
+def bridge(
+    adapter: Annotated[
+        str,
+        typer.Argument(metavar="INTERFACE:CHANNEL", help="Of python-can, as slcan:/dev/ttyACM0."),
+    ],
+    hub: Annotated[
+        str, typer.Argument(metavar="hub:NAME", help="The bus that the nodes open.")
+    ] = "hub:can0",
+    bitrate: Annotated[
+        int | None,
+        typer.Option(min=10_000, max=1_000_000, help="Of the wire, bit/s; else can.conf's."),
+    ] = None,
+) -> None:
+    """Hold an adapter that only one process can open, and serve it to all nodes as hub:NAME."""
+    with one_line_for_bad_input(), ExitStack() as opened:
+        from ato_hil.can_dbc.bridge import Passed, relay
+        from ato_hil.can_dbc.bus import BusError, choose_bus, open_bus
+
+        if choose_bus(hub).interface != "atohub":
+            raise BusError(f"bus {hub!r}: expected hub or hub:NAME")
+        if choose_bus(adapter).interface == "atohub":
+            raise BusError(f"bus {adapter!r}: expected an adapter, not another hub")
+        settings = {} if bitrate is None else {"bitrate": bitrate}
+        wire = opened.enter_context(open_bus(adapter, **settings))
+        nodes = opened.enter_context(open_bus(hub))
+        say(f"{adapter} is {hub} until Ctrl-C; a session joins with --bus {hub}")
+        passed = Passed()
+        try:
+            relay(wire, nodes, lambda: False, passed)
+        except BusError as error:
+            raise fail(str(error), EXIT_ENDED_EARLY) from None
+        except KeyboardInterrupt:
+            pass
+        finally:
+            left = f"; {passed.left_out} of other kinds left out" if passed.left_out else ""
+            say(f"frames to the wire: {passed.to_wire}, from it: {passed.from_wire}{left}")
 
 
 def bus_report(

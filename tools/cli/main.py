@@ -56,6 +56,7 @@ COMMANDS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("decode", buses.decode),
         ("profile", look.profile),
         ("bus-report", buses.bus_report),
+        ("bridge", buses.bridge),
     ),
     "Take away": (
         ("export c", export.c_command),

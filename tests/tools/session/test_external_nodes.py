@@ -315,3 +315,17 @@ def test_measured_truth_is_what_the_bus_shows() -> None:
     assert truth["force_n"].tolist() == [10.0, 10.0, -10.0]
     assert truth["traction_j"] == pytest.approx([0.1, 0.2, 0.2])
     assert truth["braking_j"] == pytest.approx([0.0, 0.0, 0.3])
+
+
+def test_a_controller_that_answers_what_has_gathered_is_no_garbage() -> None:
+    """Behind an adapter that kept the RUN_CTRL of a minute: each arms it anew, so each answer has
+    the first counter."""
+    nodes = Nodes()
+    observer = Observer([CONTROLLER], 0, 1, 0.0)
+    asked = [nodes.control(ARMED, 1) for _ in range(20)]
+    answers = []
+    for _ in range(20):
+        nodes.counters.clear()
+        answers.append(nodes.status(ARMED, 1))
+    observer.take([*asked, *answers, nodes.control(RUNNING, 1)], 0.1)
+    assert observer.state == RUNNING
