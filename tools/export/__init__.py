@@ -1,7 +1,10 @@
 """`ato-hil export c`: the firmware as C99, from the Python steps themselves.
 
-`source` reads steps, `translate` turns them into C functions, `records` the dtypes into structs,
-`folder` writes what a firmware engineer gets; `plant` puts the plant's steps around it.
+`source` reads steps. `translate` turns them into C functions: it has the statements, `expressions`
+what stands in them, `places` where variables are declared, `program` the functions that are reached
+and their names, `lines` how C is laid out. `records` turns dtypes into structs, `firmware` puts a
+law's files together, `folder` writes what a firmware engineer gets; `closed_loop` puts the plant's
+steps around it.
 """
 
 from __future__ import annotations

@@ -39,8 +39,9 @@ from ato_hil.tools.export.kinds import (
     Fields,
     Rows,
 )
+from ato_hil.tools.export.program import resolved, settled_constants
 from ato_hil.tools.export.records import Records
-from ato_hil.tools.export.translate import Program, resolved, settled_constants
+from ato_hil.tools.export.translate import new_program
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.frames import FRAME
 from ato_hil.tools.session import sil
@@ -88,7 +89,7 @@ class Loop:
                 "ato_plant_state": plant_state,
             },
         )
-        self.program = Program(self.records.name)
+        self.program = new_program(self.records.name)
         _, sense, act = plant.build(model)
         tick = controller_firmware.build_tick(module.step)
         limits = Fields(

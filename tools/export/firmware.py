@@ -31,6 +31,14 @@ from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.registry import Law, law_label, load_law
 from ato_hil.tools.export import ExportError
 from ato_hil.tools.export.kinds import INT, Array, Record
+from ato_hil.tools.export.lines import comment_lines, number_text, wrapped
+from ato_hil.tools.export.program import (
+    Function,
+    Program,
+    resolved,
+    settled_constants,
+    signals_of,
+)
 from ato_hil.tools.export.records import Records, initialiser
 from ato_hil.tools.export.source import (
     comment_text,
@@ -38,16 +46,7 @@ from ato_hil.tools.export.source import (
     paragraphs,
     source_of,
 )
-from ato_hil.tools.export.translate import (
-    Function,
-    Program,
-    comment_lines,
-    number_text,
-    resolved,
-    settled_constants,
-    signals_of,
-    wrapped,
-)
+from ato_hil.tools.export.translate import new_program
 
 HERE = Path(__file__).parent
 # What the header needs of the interface, by the name that it has there.
@@ -86,7 +85,7 @@ class Translated:
         self.modules = tick_sources.modules_of([made.first.law])
         params, state = firmware.params_dtype(law.PARAMS), firmware.state_dtype(law.STATE)
         self.records = Records(self.modules, {"ato_params": params, "ato_state": state})
-        self.program = Program(self.records.name)
+        self.program = new_program(self.records.name)
         cells = Array(np.dtype(made.first.memory_dtype), ("ATO_CELLS", "ATO_WORDS"))
         fields: Any = params.fields
         state_fields: Any = state.fields

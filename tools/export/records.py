@@ -11,8 +11,8 @@ import numpy as np
 
 from ato_hil.tools.export import ExportError
 from ato_hil.tools.export.kinds import c_number
+from ato_hil.tools.export.lines import comment_lines, number_text, wrapped
 from ato_hil.tools.export.source import comment_text, record_comments, source_of
-from ato_hil.tools.export.translate import comment_lines, number_text, wrapped
 
 GENERIC = {"PARAMS", "STATE"}  # names that say nothing without their module's
 FORMAT = re.compile(r"\bQ(\d+)\b")

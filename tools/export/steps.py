@@ -7,13 +7,9 @@ from types import ModuleType
 from typing import Any
 
 from ato_hil.tools.export import firmware
+from ato_hil.tools.export.program import Function, Program, resolved, settled_constants
 from ato_hil.tools.export.records import Records
-from ato_hil.tools.export.translate import (
-    Function,
-    Program,
-    resolved,
-    settled_constants,
-)
+from ato_hil.tools.export.translate import new_program
 
 INCLUDES = ("math.h", "stdbool.h", "stddef.h", "stdint.h")
 ASSERT = "#define ATO_ASSERT(claim, name) typedef char ato_assert_##name[(claim) ? 1 : -1]"
@@ -23,7 +19,7 @@ def text_of(roots: Sequence[tuple[str, Any, Sequence[Any]]], modules: Sequence[M
     """C of steps with all that they call: (name in C, step, kinds of its parameters) of each;
     `modules` define the records. Raises ExportError."""
     records = Records(modules, {})
-    program = Program(records.name)
+    program = new_program(records.name)
     functions = []
     for name, step, kinds in roots:
         function = program.root(step, tuple(kinds))

@@ -12,8 +12,10 @@ from ato_hil.tools.export import firmware
 from ato_hil.tools.export.fmu.description import About
 from ato_hil.tools.export.fmu.variables import Frame, Interface
 from ato_hil.tools.export.kinds import INT, SignalPlace
+from ato_hil.tools.export.lines import number_text
+from ato_hil.tools.export.program import resolved, settled_constants
 from ato_hil.tools.export.records import Records
-from ato_hil.tools.export.translate import Program, number_text, resolved, settled_constants
+from ato_hil.tools.export.translate import new_program
 
 HERE = Path(__file__).parent / "c"
 TAGS = {"Enumeration": "INT64"}
@@ -72,7 +74,7 @@ def variables_header(about: About, made: Interface, names: dict[str, str]) -> st
 def frames_file(made: Interface) -> str:
     """fmu_frames.c: the codec's and the protection's own steps, and the tables of the DBC."""
     records = Records([codec, e2e], {})
-    program = Program(records.name)
+    program = new_program(records.name)
     place = SignalPlace()
     roots = [program.root(codec.get, (INT, place))]
     if not made.has_bus:
