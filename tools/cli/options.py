@@ -27,6 +27,13 @@ class External(StrEnum):
     plant = "plant"
 
 
+class Trace(StrEnum):
+    """What a trace keeps."""
+
+    auto = "auto"
+    full = "full"
+
+
 class Viewer(StrEnum):
     """Where the trace is shown."""
 

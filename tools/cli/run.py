@@ -34,6 +34,7 @@ from ato_hil.tools.cli.options import (
     Pace,
     Runs,
     Seed,
+    Trace,
     Viewer,
 )
 from ato_hil.tools.cli.output import console
@@ -46,8 +47,8 @@ if TYPE_CHECKING:
     from ato_hil.plant_sim.scenario import Loaded
     from ato_hil.tools.session.session import Options
 
-# What a control period of a train takes, at most: measured over subway, crh3, crh3-learning.
-BYTES_OF_TRACE, BYTES_OF_RECORDING = 640, 320
+# What a control period of a train takes, at most.
+BYTES_OF_RECORDING = 320
 LARGE_BYTES = 1e9  # said before it is written
 STARTING = "loading or compiling the steps"
 
@@ -89,7 +90,7 @@ class Screen:
         )
         size = len(runs) * loaded.ticks * loaded.trains * self.bytes_per_tick
         if size > LARGE_BYTES:
-            text = f"this will write about {size / 1e9:.1f} GB; --no-trace leaves the trace out"
+            text = f"this will write about {size / 1e9:.1f} GB; --trace auto keeps the trace small"
             say(text, "yellow")
         say_if_compiling()
         self.task = self.bar.add_task(
@@ -200,7 +201,17 @@ def run(
         Path | None,
         typer.Option(help="Learning memory: read if it exists, written after each run."),
     ] = None,
-    trace: Annotated[bool, typer.Option(help="Write trace.rrd.")] = True,
+    trace: Annotated[
+        Trace,
+        typer.Option(
+            help="What trace.rrd keeps. Auto: every run, or beyond --trace-mb the first, the last,"
+            " the worst and faulty ones whole, the others thinned by smallest and largest value."
+        ),
+    ] = Trace.auto,
+    trace_mb: Annotated[
+        int, typer.Option(min=1, help="Size of trace.rrd from which --trace auto thins runs, MB.")
+    ] = 500,
+    no_trace: Annotated[bool, typer.Option("--no-trace", help="Write no trace.rrd.")] = False,
     record: Annotated[
         Path | None,
         typer.Option(help="Record every frame of the runs: FILE.blf, .asc, .log, .pcapng or .mf4."),
@@ -232,12 +243,13 @@ def run(
     """Run a scenario: the train follows its profile, run by run."""
     with one_line_for_bad_input(), ExitStack() as stack:
         from ato_hil.tools.session.session import Options
+        from ato_hil.tools.trace.budget import BYTES_OF_TICK
 
         expected = [parse(text) for text in expect or ()]
         nodes = tuple(dict.fromkeys(node.value for node in external or ()))
         viewer = None
         if view is not None:
-            if not trace:
+            if no_trace:
                 raise fail("--view shows the trace, so not with --no-trace", EXIT_BAD_INPUT)
             viewer = stack.enter_context(LiveView(view.value))
         if mode is Mode.pil and firmware is None:
@@ -260,7 +272,8 @@ def run(
                 seed=seed,
                 out=place.work,
                 memory=memory,
-                trace=trace,
+                trace=not no_trace,
+                trace_bytes=trace_mb * 1_000_000 if trace is Trace.auto else None,
                 record=recorded,
                 external=nodes,
                 faults=faults,
@@ -270,7 +283,9 @@ def run(
                 firmware=firmware,
                 board=board.value,
             )
-            size = BYTES_OF_TRACE * trace + BYTES_OF_RECORDING * (record is not None)
+            # A trace that is thinned stays small.
+            whole = not no_trace and (trace is Trace.full or viewer is not None)
+            size = BYTES_OF_TICK * whole + BYTES_OF_RECORDING * (record is not None)
             summary = _run(options, Screen(mode, expected, size))
         _print_end(summary, replace(options, out=place.final, record=record))
         otherwise = unmet(expected, summary["runs"][-1])
@@ -334,6 +349,8 @@ def _print_end(summary: dict[str, Any], options: Options) -> None:
         cost = summary["trace"]
         size = f"{cost['bytes'] / 1e6:.1f} MB, {cost['us_per_frame']:.2f} µs a frame"
         say(f"trace   {trace_file}   {size}")
+        if cost["thinned_runs"]:
+            say(f"        (thinned: runs {spans(cost['thinned_runs'])}; --trace full keeps all)")
         say(f"        (open it with: ato-hil view {folder})")
     if options.faults is not None:
         injected = ", ".join(f"{n} {kind}" for kind, n in summary["faults_injected"].items())
@@ -356,6 +373,17 @@ def _not_controlled(summary: dict[str, Any]) -> str:
         f"not controlled in run {', '.join(runs)}: commands were missing or stale for longer than"
         " atp.command_age_max_ticks, so the vehicle braked"
     )
+
+
+def spans(numbers: Sequence[int]) -> str:
+    """Whole numbers in rising order as a person writes them: 2-18, 20."""
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1][1:] = [number]
+        else:
+            parts.append([number])
+    return ", ".join("-".join(str(end) for end in part) for part in parts)
 
 
 def _wait_for(viewer: LiveView | None) -> None:

@@ -87,6 +87,8 @@ class Folder:
             if not all(len(table) for table in (*frames, *truths)):
                 place = self.trace_file if self.trace_file.exists() else f"{self.path}, no trace"
                 missing = f"neither signals nor true state of it in {place}"
+                if number in self._thinned:
+                    missing = f"thinned in {place}; --trace full keeps every run whole"
             yield book.add(
                 *(number, frames, truths, faults, seconds),
                 injected=[event for event in events if event.run == number],
@@ -106,6 +108,11 @@ class Folder:
             *(self.name, file, self.case, (), digest, self.scenario),
             *(segments, evaluate(segments, period_s)),
         )
+
+    @property
+    def _thinned(self) -> list[int]:
+        """Runs of which the trace has the smallest and largest values alone."""
+        return list(self.summary.get("trace", {}).get("thinned_runs", ()))
 
     def _injected(self) -> list[Event]:
         """Of faults.csv, if there is one."""
@@ -131,6 +138,8 @@ class Folder:
     def _truth(self, run: int, train: int) -> np.ndarray:
         """[ticks] of plant.TRUTH, likewise."""
         names = TRUTH.names or ()
+        if run in self._thinned:
+            return np.zeros(0, TRUTH)
         columns = {name: self._trace.get((f"truth/{name}", run, train)) for name in names}
         ticks = max((len(c.values) for c in columns.values() if c is not None), default=0)
         table = np.full(ticks, np.nan, TRUTH)

@@ -21,6 +21,7 @@ from ato_hil.tools.session import boards, in_process, pil, processes
 from ato_hil.tools.session.interrupts import Interrupts
 from ato_hil.tools.session.options import Listener, Setup
 from ato_hil.tools.trace import facts
+from ato_hil.tools.trace.budget import trace_writer
 from ato_hil.tools.trace.writer import TraceError, TraceWriter
 
 
@@ -29,6 +30,7 @@ class Maker(Protocol):
 
     about: dict[str, Any]  # for summary.json: bus, controller
     us_per_frame: float | None  # that the trace has taken
+    thinned: list[int]  # runs that are not whole in the trace
 
     @property
     def injected(self) -> list[faults.Event] | None:
@@ -56,6 +58,7 @@ class InProcess:
         self.setup, self.listener, self.interrupts = setup, listener, interrupts
         self.about: dict[str, Any] = {}
         self.us_per_frame: float | None = None
+        self.thinned: list[int] = []
         self._writer: TraceWriter | None = None
 
     def runs(self, recording: Recording | None) -> Generator[Run, None, None]:
@@ -63,7 +66,7 @@ class InProcess:
         setup = self.setup
         with ExitStack() as stack:
             if setup.options.trace:
-                self._writer = writer = TraceWriter(
+                self._writer = writer = trace_writer(
                     setup.options.out / "trace.rrd",
                     reference=setup.loaded.profile,
                     **setup.trace_settings,
@@ -91,6 +94,7 @@ class InProcess:
         except TraceError as error:
             raise processes.RunError(str(error)) from None
         self.us_per_frame = writer.us_per_frame
+        self.thinned = writer.thinned
 
     def _made(self) -> Generator[Run, None, None]:
         setup, asked = self.setup, self.setup.faults

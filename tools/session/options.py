@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -22,6 +22,7 @@ from ato_hil.tools.runs import can_logs, limits, locks, onboard
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
 from ato_hil.tools.session import boards, processes
 from ato_hil.tools.session.external_nodes import CONTROLLER, PLANT
+from ato_hil.tools.trace.budget import thinning
 from ato_hil.tools.trace.live_viewer import LiveView
 
 RUNS_MAX = 4095  # Iteration has 12 bits
@@ -71,6 +72,7 @@ class Options:
     out: Path
     memory: Path | None
     trace: bool = True
+    trace_bytes: int | None = None  # beyond which the trace has not every run whole
     record: Path | None = None  # recording of the frames
     external: tuple[str, ...] = ()  # nodes that are not ours: plant, controller
     faults: Path | None = None  # file of faults to inject
@@ -119,8 +121,17 @@ class Setup:
         return onboard.cars(self.loaded)
 
     @property
+    def thinning(self) -> int | None:
+        """Ticks of a window of the runs that the trace has not whole; None if it has all. Who looks
+        on while it runs sees all."""
+        options = self.options
+        if not options.trace or options.viewer is not None:
+            return None
+        return thinning(options.trace_bytes, len(self.runs), self.loaded.ticks * len(self.members))
+
+    @property
     def trace_settings(self) -> dict[str, Any]:
-        """What a trace needs to know, as TraceWriter takes it, but for path and reference."""
+        """What a trace needs to know, as `trace_writer` takes it, but for path and reference."""
         options, loaded = self.options, self.loaded
         estimates = () if self.law == EXTERNAL_LAW else load_law(self.law).ESTIMATES
         return {
@@ -134,6 +145,7 @@ class Setup:
             "spacing_m": loaded.scenario.line.spacing_m if loaded.scenario.line else 0.0,
             "words": self.words,
             "live_port": options.viewer.port if options.viewer else None,
+            "every": self.thinning,
         }
 
     def learned(self, cells: np.ndarray) -> tuple[np.ndarray, int]:
@@ -187,7 +199,14 @@ def check(options: Options, held: ExitStack) -> Setup:
     asked = None
     if options.faults is not None:
         asked = _faults(options, options.faults, loaded)
-    return Setup(options, loaded, trains, law, calibrations, runs, asked, tuple(weaker))
+    setup = Setup(options, loaded, trains, law, calibrations, runs, asked, tuple(weaker))
+    if setup.thinning is None:
+        return setup
+    thinned = (
+        f"the trace keeps the first, the last, the worst and every faulty run whole, of the others"
+        f" the smallest and largest value of {setup.thinning} ticks"
+    )
+    return replace(setup, notes=(*setup.notes, thinned))
 
 
 def _refuse_what_is_for_one_train(options: Options) -> None:

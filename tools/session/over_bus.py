@@ -46,6 +46,7 @@ class OverBus:
         self.setup, self.listener, self.interrupts = setup, listener, interrupts
         self.recording: Recording | None = None
         self.us_per_frame: float | None = None  # that the trace has taken
+        self.thinned: list[int] = []  # runs that are not whole in the trace
         self.injected: list[faults.Event] | None = None  # faults, once all is over
         self._recorder: processes.Node | None = None
         self._kept = Path()  # files on their way
@@ -115,7 +116,8 @@ class OverBus:
                 if setup.faults is not None:
                     self.injected = faults.injected(kept)
                 if self._recorder is not None and "traced" in self._recorder.said:
-                    self.us_per_frame = self._recorder.said["traced"]["us_per_frame"]
+                    traced = self._recorder.said["traced"]
+                    self.us_per_frame, self.thinned = traced["us_per_frame"], traced["thinned"]
             self._refuse_incomplete_trace()
 
     def tell(self, run: Run) -> None:

@@ -13,7 +13,8 @@ It says on stdout, in JSON lines:
      "digest": "…", "digests": ["…"],                      frames of other kinds, digest of all runs
      "complete": true}                                     so far, and that of each train
     {"event": "error", "message": "…"}                     it ends early
-    {"event": "traced", "us_per_frame": …}                 the trace is complete; time for a frame
+    {"event": "traced", "us_per_frame": …, "thinned": []}  the trace is complete; time for a frame,
+                                                           runs that are not whole in it
 
 and takes on stdin, where a file is deleted when it has been read:
 
@@ -71,6 +72,7 @@ from ato_hil.tools.runs.frames import (
     ticks_of,
 )
 from ato_hil.tools.trace import facts
+from ato_hil.tools.trace.budget import trace_writer
 from ato_hil.tools.trace.writer import Reference, TraceWriter
 
 BATCH_TICKS = 1000  # of the trace
@@ -362,7 +364,7 @@ def frames_folder(kept: Path, train: int) -> Path:
 
 
 def save_settings(path: Path, reference: Reference, **settings: Any) -> None:
-    """Write the file for `--trace`: what TraceWriter takes, but for its path."""
+    """Write the file for `--trace`: what `trace_writer` takes, but for its path."""
     np.savez(
         path,
         settings=np.array(json.dumps(settings)),
@@ -381,7 +383,7 @@ def open_trace(path: Path, settings_file: Path) -> TraceWriter:
             speed_m_s=stored["speed_m_s"],
             acceleration_m_s2=stored["acceleration_m_s2"],
         )
-    return TraceWriter(path, reference=reference, **settings)
+    return trace_writer(path, reference=reference, **settings)
 
 
 def main() -> int:
@@ -443,7 +445,7 @@ def main() -> int:
         status, whole = 1, False
     opened.close()
     if trace is not None and whole:
-        tell("traced", us_per_frame=trace.us_per_frame)
+        tell("traced", us_per_frame=trace.us_per_frame, thinned=trace.thinned)
         while trace.is_live and not stop.requested:
             time.sleep(IDLE_S)
         trace.end_live()

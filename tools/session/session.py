@@ -218,6 +218,7 @@ class Session:
             self.summary["trace"] = {
                 "bytes": (out / "trace.rrd").stat().st_size,
                 "us_per_frame": maker.us_per_frame,
+                "thinned_runs": sorted(maker.thinned),
             }
         write_json(out / "summary.json", self.summary)
 

@@ -189,6 +189,19 @@ def corners(ticks: np.ndarray, values: np.ndarray, ramps: bool = True) -> np.nda
     return kept
 
 
+def extremes(values: np.ndarray, every: int) -> np.ndarray:
+    """Which rows to keep of values (rows, lines): the first, the last, and in each window of
+    `every` rows those with the smallest and the largest value of a line."""
+    kept = {0, len(values) - 1}
+    starts = np.arange(0, len(values), every)
+    for line in values.T:
+        for sign in (1.0, -1.0):
+            padded = np.full(len(starts) * every, np.inf)
+            padded[: len(line)] = np.where(np.isnan(line), np.inf, sign * line)
+            kept.update((starts + padded.reshape(-1, every).argmin(axis=1)).tolist())
+    return np.array(sorted(kept))
+
+
 def car_force_plot(cars: int) -> Plot:
     lines = [
         Line(CAR_FORCES[car // 2], f"Car{car + 1}", f"car {car + 1}", APART[car])

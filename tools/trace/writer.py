@@ -79,6 +79,7 @@ from ato_hil.tools.trace.plots import (
     Lane,
     car_force_plot,
     corners,
+    extremes,
     state_names,
     state_text,
     table_of,
@@ -185,6 +186,7 @@ class TraceWriter:
         self._train_rows: defaultdict[int, list[dict[str, Any]]] = defaultdict(list)
         self._frames = 0
         self._seconds = 0.0
+        self.thinned: list[int] = []  # runs that are not whole
 
         # Equal for equal arguments, but for no two files: a viewer merges recordings of one name.
         identity = (str(path.resolve()), title, period_s, cars, estimates, first_run, last_run)
@@ -208,10 +210,13 @@ class TraceWriter:
         stream.send_recording_name(title)
         return stream
 
-    def frames(self, run: int, frames: np.ndarray, train: int = 0) -> None:
+    def frames(self, run: int, frames: np.ndarray, train: int = 0, every: int = 1) -> None:
         """Log FRAME rows of whole ticks; the batches of a train's run follow one another.
 
         Batches of 100 ticks and more are cheap: a batch costs some milliseconds by itself.
+
+        :param every: above 1, of so many ticks only the smallest and the largest value of a line
+            are logged, and no frames.
         """
         started = time.perf_counter()
         found = {message.name: columns(frames, message) for message in MESSAGES}
@@ -224,16 +229,17 @@ class TraceWriter:
             colours = [line.colour for line in plot.lines]
             widths = [line.width for line in plot.lines]
             entity = self._entity(f"bus/{plot.name}", run, train)
-            self._log_scalars(entity, ticks, values, names, colours, widths)
+            self._log_scalars(entity, ticks, values, names, colours, widths, every=every)
         for number, name in enumerate(self._estimates):
             ticks, value = estimate(frames, number)
             entity = self._entity(f"bus/estimate_{number}", run, train)
             colour = self._colour(run, train)
-            self._log_scalars(entity, ticks, value[:, None], [name], [colour])
+            self._log_scalars(entity, ticks, value[:, None], [name], [colour], every=every)
         for lane in LANES:
             self._log_lane(run, train, lane, *found[lane.message.name])
         self._log_traffic(run, train, frames, found)
-        self._log_frames(run, train, frames)
+        if every == 1:
+            self._log_frames(run, train, frames)
         self._frames += len(frames)
         self._seconds += time.perf_counter() - started
 
@@ -250,13 +256,15 @@ class TraceWriter:
                 f"reference/{field}{branch}", ticks, values, ["reference"], [REFERENCE]
             )
 
-    def truth(self, run: int, table: np.ndarray, train: int = 0) -> None:
+    def truth(self, run: int, table: np.ndarray, train: int = 0, every: int = 1) -> None:
         """Log the true state of the plant: a structured array of float64 fields, a row a tick.
 
         The names of the fields end in their units; a field of NaN alone is none of this train's.
         A table with `position_m` is the plant's state: it shares one entity, the speeds that
         supervise the train another, and its errors against the reference are logged beside it. Of
         another table, such as the Lyapunov function, each field is an entity.
+
+        :param every: as of `frames`.
         """
         ticks = np.arange(len(table))
         label = self._run_name(run) if self._trains == 1 else f"train_{train + 1}"
@@ -265,10 +273,12 @@ class TraceWriter:
         if "position_m" in fields:
             state = [field for field in fields if field not in SUPERVISION]
             colour = TRUE if self._trains == 1 else self._colour(run, train)
-            self._log_fields(f"truth/{STATE}", run, train, table, state, [colour] * len(state))
+            self._log_fields(
+                f"truth/{STATE}", run, train, table, state, [colour] * len(state), every
+            )
             limits = [field for field in fields if field in SUPERVISION]
             colours = [SUPERVISION[field] for field in limits]
-            self._log_fields(f"truth/{LIMITS}", run, train, table, limits, colours)
+            self._log_fields(f"truth/{LIMITS}", run, train, table, limits, colours, every)
             for error, field in ERRORS.items():
                 reference = getattr(self._references.get(run, self._reference), field)
                 if field == "position_m":
@@ -276,12 +286,13 @@ class TraceWriter:
                 count = min(len(table), len(reference))
                 values = (table[field][:count] - reference[:count])[:, None]
                 entity = self._entity(f"truth/{error}", run, train)
-                self._log_scalars(entity, ticks[:count], values, *own)
+                self._log_scalars(entity, ticks[:count], values, *own, every=every)
         else:
             for field in fields:
                 entity = self._entity(f"truth/{field}", run, train)
-                self._log_scalars(entity, ticks, table[field][:, None], *own)
-        if train == 0 and {"position_m", "speed_m_s"} <= set(fields):
+                self._log_scalars(entity, ticks, table[field][:, None], *own, every=every)
+        shown = train == 0 and run >= (self._run or 0)
+        if shown and {"position_m", "speed_m_s"} <= set(fields):
             # The limit is on the bus already; what else supervises the train is known here alone.
             self._fields = tuple(fields)
             self._log_speed_over_position(run, table, fields)
@@ -389,6 +400,8 @@ class TraceWriter:
             self._log_memory()
         for train, (run, traffic, _checks) in self._traffic.items():
             self._log_windows(run, train, traffic, traffic.finish())
+        if self._layout is not None:
+            self._file.send_blueprint(of_session(self._layout))
         try:
             self._file.flush()
         except RuntimeError as error:
@@ -430,10 +443,12 @@ class TraceWriter:
             timing=any(entity.startswith("timing/") for entity in self._logged),
         )
         if layout != self._layout:
-            self._layout = layout
+            # A layout takes 0.4 MB: the file gets the first and the last one.
+            first, self._layout = self._layout is None, layout
             blueprint = of_session(layout)
             for stream in self._streams:
-                stream.send_blueprint(blueprint)
+                if first or stream is not self._file:
+                    stream.send_blueprint(blueprint)
 
     def _entity(self, name: str, run: int, train: int) -> str:
         return f"{name}/{self._place(run, train)}"
@@ -471,13 +486,15 @@ class TraceWriter:
         table: np.ndarray,
         fields: Sequence[str],
         colours: list[Colour],
+        every: int,
     ) -> None:
         """Log columns of a table as the lines of one entity, named as the fields."""
         if fields:
             values = np.column_stack([table[field] for field in fields])
             place = self._entity(entity, run, train)
             ticks = np.arange(len(table))
-            self._log_scalars(place, ticks, values, list(fields), colours, ramps=False)
+            style = (list(fields), colours)
+            self._log_scalars(place, ticks, values, *style, ramps=False, every=every)
 
     def _log_scalars(
         self,
@@ -488,13 +505,14 @@ class TraceWriter:
         colours: list[Colour],
         widths: Sequence[float] = (THIN,),
         ramps: bool = True,
+        every: int = 1,
     ) -> None:
         """Log a table of values (rows, lines); the first time, also how to draw its lines. Rows are
-        left out as `corners` says."""
+        left out as `corners` says, and above 1 as `extremes` says."""
         if len(values) == 0:
             return
         self._style(entity, names, colours, widths)
-        kept = corners(ticks, values, ramps)
+        kept = corners(ticks, values, ramps) if every == 1 else extremes(values, every)
         content = self._rr.Scalars.columns(scalars=values[kept])
         self._send(entity, self._index(ticks[kept]), content)
 
@@ -565,7 +583,7 @@ class TraceWriter:
             ticks, words = found[message.name]
             entity = self._entity("bus/end_to_end", run, train) + f"/{message.name}"
             self._log_states(entity, run, ticks, checks.take(message, words), CHECKS)
-        if train == 0:
+        if train == 0 and run == self._run:
             table = self._rr.TextDocument(traffic.table(checks), media_type="text/markdown")
             self._log("bus/messages", table)
 

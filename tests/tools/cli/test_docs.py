@@ -43,7 +43,10 @@ def test_every_signal_and_every_option_is_there() -> None:
         for signal in message.signals:
             assert (f"| {signal.name} |" in section) == (signal.name not in docs.PROTECTION)
     commands = docs.command_line()
-    for text in ("--mode {hil,sil,mil,pil} | ".replace(" | ", "` | `hil`"), "`--trace/--no-trace`"):
+    for text in (
+        "--mode {hil,sil,mil,pil} | ".replace(" | ", "` | `hil`"),
+        "`--sessions/--no-sessions`",
+    ):
         assert text in commands
     assert "| `[LAWS...]` |" in commands
     assert "    ato-hil replay FILE [OPTIONS]\n" in commands

@@ -15,6 +15,7 @@ from ato_hil.tools.cli.options import Mode
 from ato_hil.tools.runs import expect
 from ato_hil.tools.runs.expect import ExpectError, parse, unmet
 from ato_hil.tools.session import sil
+from ato_hil.tools.trace.budget import BYTES_OF_TICK
 
 ROW = {"run": 2, "max_position_error_m": 0.01, "stop_error_m": None, "faults": ["overspeed"]}
 
@@ -66,8 +67,8 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
 
 def test_a_gigabyte_is_announced(screen: io.StringIO) -> None:
     loaded = load("subway")
-    for runs, said in ((range(1, 11), False), (range(1, 101), True)):
-        run.Screen(Mode.sil, bytes_per_tick=run.BYTES_OF_TRACE).begin(loaded, "cailc", runs)
+    for runs, said in ((range(1, 11), False), (range(1, 181), True)):
+        run.Screen(Mode.sil, bytes_per_tick=BYTES_OF_TICK).begin(loaded, "cailc", runs)
         assert ("this will write about 1.2 GB" in screen.getvalue()) is said
     run.Screen(Mode.sil).begin(loaded, "cailc", range(1, 4096))
     assert screen.getvalue().count("GB") == 1
