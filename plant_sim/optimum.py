@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from ato_hil.can_dbc.step import int64, step
 
 BARRIER_FIRST = 1.0  # times the cost of the barrier's terms, J/kg
-BARRIER_LAST = 1e-5
+BARRIER_LAST = 3e-6
 BARRIER_FACTOR = 0.15
 NEWTON_MAX = 60  # a barrier
 HALVINGS_MAX = 40

@@ -2,9 +2,10 @@
 
 The run of least energy, or of least time, is found as speeds by position (`optimum`). The middles
 of its cells become knots of the acceleration over time, straight in between; knots that lie on a
-line are left out. What the table then misses at its end (speed and way, below 0.1 m/s and a few
-metres) is spread over the whole run, and what rounding to integers leaves is laid into single
-control periods, so that the train stands at its stop to the last bit.
+line are left out. What the speed misses by that is made up for within seconds, what the table then
+misses at its end (some cm/s, a metre on tens of km) is spread over the whole run, and what rounding
+to integers leaves is laid into single control periods, so that the train stands at its stop to the
+last bit.
 """
 
 from __future__ import annotations
@@ -32,13 +33,14 @@ from ato_hil.plant_sim.track import Track, sections
 from ato_hil.plant_sim.trains import point
 from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
-CELL_S = 0.2  # what a cell takes a fast train
-SPEED_SPARE_M_S = 0.04  # by which the table's speed may differ from that of the cells
+CELL_S = 0.15  # what a cell takes a fast train
+SPEED_SPARE_M_S = 0.01  # by which the table's speed may differ from that of the cells
 KNOT_M_S2 = 2e-4  # knots closer than this to a straight line are left out
-SPARE = 0.01  # of acceleration and jerk, for what is spread over the run
+SPARE = 0.002  # of acceleration and jerk, for what is spread over the run
 ROUNDS = 12  # until the table's way is that of the plan, so far:
-NUDGE_M = 5e-5  # of the way; what is left is the work of single control periods,
+NUDGE_M = 1e-4  # of the way; what is left is the work of single control periods,
 NUDGE_UNITS = 300  # with so many units of jerk (1.6 mm/s^3) at most, unless that is too few
+MADE_UP_UNITS = 100  # of jerk (0.6 mm/s^3), at most, for what the speed misses
 LONGEST_TICKS = 512  # of a segment: its jerk is rounded, and what that misses is made up for
 
 
@@ -78,8 +80,8 @@ def plan_running(
             squares = optimum.cheapest(bounds, mesh, plan.duration_s)
     except Infeasible as error:
         raise PlanError(str(error)) from None
-    knots, levels = _course(mesh, squares, ticks, period_s)
-    segments = _table(knots, levels, plan.distance_m, period_s)
+    course = _course(mesh, squares, ticks, period_s)
+    segments = _table(*course, plan.distance_m, period_s)
     _check(plan, evaluate(segments, period_s), segments, line, units.jerk_m_s3)
     return segments
 
@@ -202,25 +204,30 @@ def gradient_m_s2(track: np.ndarray, x: NDArray[np.float64]) -> NDArray[np.float
 
 def _course(
     mesh: Mesh, squares: NDArray[np.float64], ticks: int, period_s: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Knots in whole ticks, 0 and `ticks` among them, and the acceleration at each."""
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Knots in whole ticks, 0 and `ticks` among them; acceleration and speed at each."""
     v = np.sqrt(squares)
     times = 2 * mesh.dx_m / (v[:-1] + v[1:])
     ends = np.cumsum(times)
     # A time that is a little off is stretched; the way stays.
     pace = ends[-1] / (ticks * period_s)
     middles = np.concatenate([[0.0], ends - times / 2, ends[-1:]]) / (pace * period_s)
-    levels = np.concatenate([[0.0], np.diff(squares) / (2 * mesh.dx_m) * pace * pace, [0.0]])
-    knots = np.unique(np.clip(np.rint(middles).astype(np.int64), 0, ticks))
-    levels = np.interp(knots, middles, levels)
-    kept = _simplified(knots, levels)
-    knots, levels = knots[kept], levels[kept]
+    inner = np.diff(squares) / (2 * mesh.dx_m) * pace * pace
+    levels = np.concatenate([[0.0], inner, [0.0]])
+    # The straight lines leave the ends of cells their speeds; those of the middles they bend.
+    turn = np.diff(np.concatenate([-inner[:1], inner, -inner[-1:]]))
+    bent = (v[:-1] + v[1:]) / 2 * pace - (turn[:-1] + turn[1:]) * times / pace / 16
+    speeds = np.concatenate([[0.0], bent, [0.0]])
+    all_knots = np.unique(np.clip(np.rint(middles).astype(np.int64), 0, ticks))
+    levels = np.interp(all_knots, middles, levels)
+    kept = _simplified(all_knots, levels)
+    knots, levels = all_knots[kept], levels[kept]
     pieces = [
         np.linspace(a, b, 2 + (b - a - 1) // LONGEST_TICKS)[:-1].round().astype(np.int64)
         for a, b in itertools.pairwise(knots.tolist())
     ]
     fine = np.concatenate([*pieces, knots[-1:]])
-    return fine, np.interp(fine, knots, levels)
+    return fine, np.interp(fine, knots, levels), np.interp(fine, middles, speeds)
 
 
 def _simplified(knots: NDArray[np.int64], levels: NDArray[np.float64]) -> list[int]:
@@ -238,18 +245,20 @@ def _simplified(knots: NDArray[np.int64], levels: NDArray[np.float64]) -> list[i
 
 
 def _table(
-    knots: NDArray[np.int64], levels: NDArray[np.float64], distance_m: float, period_s: float
+    knots: NDArray[np.int64],
+    levels: NDArray[np.float64],
+    speeds: NDArray[np.float64],
+    distance_m: float,
+    period_s: float,
 ) -> NDArray[np.void]:
     """Integers that end at rest to the last bit, and at `distance_m` within a millimetre."""
     units = units_of(period_s)
-    ticks = int(knots[-1])
-    part = knots / ticks
-    bump = part * (1 - part)  # changes the speed, the next one the way alone
-    tilt = bump * (1 - 2 * part)
-    duration_s = ticks * period_s
+    duration_s = int(knots[-1]) * period_s
+    part = knots / int(knots[-1])
+    bump = part * (1 - part)
+    missing_m = 0.0
     for _ in range(ROUNDS):
-        rows = _rows(knots, levels, units.acceleration_m_s2)
-        late_m_s = _speed_at_end(rows) * units.change_m_s / 2
+        rows = _rows(knots, levels / units.acceleration_m_s2, speeds * 2 / units.change_m_s)
         _settle(rows)
         segments = segments_of(rows)
         missing_m = distance_m - float(evaluate(segments, period_s).position_m[-1])
@@ -258,10 +267,10 @@ def _table(
             segments = segments_of(rows)
             _nudge(rows, distance_m - float(evaluate(segments, period_s).position_m[-1]))
             return segments_of(rows)
-        # The bump's integral is 1/6, the tilt's way 1/60; the bump's way is that of what `_settle`
-        # then has not to do.
-        levels = levels - bump * (6 * late_m_s / duration_s)
-        levels = levels + tilt * (60 * missing_m / (duration_s * duration_s))
+        # bump^2 / 2 of speed, whose integral is 1/60, and its derivative.
+        more = 60 * missing_m / duration_s
+        speeds = speeds + more / 2 * bump * bump
+        levels = levels + more / duration_s * bump * (1 - 2 * part)
     raise PlanError(f"the table ends {missing_m:.4f} m from distance_m = {distance_m:g}")
 
 
@@ -283,15 +292,26 @@ def _speed_at_end(rows: NDArray[np.int64]) -> int:
 
 
 def _rows(
-    knots: NDArray[np.int64], levels: NDArray[np.float64], unit_m_s2: float
+    knots: NDArray[np.int64], levels: NDArray[np.float64], speeds: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Jerk by tick through the knots; each segment makes up for the rounding of those before."""
+    """Jerk by tick through the knots, all in units of the table; each segment makes up for what
+    those before it missed of the acceleration and of the speed."""
     rows = np.zeros(int(knots[-1]), np.int64)
-    a = 0
-    for begin, end, goal in zip(knots[:-1], knots[1:], levels[1:] / unit_m_s2, strict=True):
-        jerk = round((goal - a) / (end - begin))
+    a = v = 0
+    for begin, end, level, speed in zip(
+        knots[:-1].tolist(), knots[1:].tolist(), levels[1:].tolist(), speeds[1:].tolist(),
+        strict=True,
+    ):  # fmt: skip
+        n = end - begin
+        straight = (level - a) / n
+        # With this jerk the speed would miss so much; a jerk more a tick squared mends a unit of
+        # it. A third each segment of equal length: errors die out without swinging.
+        missed = speed - (v + 2 * a * n + straight * n * n)
+        mend = missed / (3 * n * n) if end < len(rows) else 0.0  # the last one: to rest
+        jerk = round(straight + min(max(mend, -MADE_UP_UNITS), MADE_UP_UNITS))
         rows[begin:end] = jerk
-        a += jerk * int(end - begin)
+        v += 2 * a * n + jerk * n * n
+        a += jerk * n
     return rows
 
 

@@ -13,6 +13,7 @@ from ato_hil.plant_sim.profile import evaluate
 from ato_hil.plant_sim.running import plan_running, road, work_j
 from ato_hil.plant_sim.track import Track
 from ato_hil.plant_sim.trains import point
+from tests import least_energy
 
 PERIOD_S = 0.01
 LEVEL = road(Track(), Atp(speeds=[StaticSpeed(until_m=1e5, speed_m_s=100.0)]))
@@ -116,6 +117,30 @@ def test_every_table_keeps_what_was_asked(gradients, limits, pace, length_m):
     assert -profile.acceleration_m_s2.min() <= 0.6 * (1 + 1e-6)
     jerk = np.abs(np.diff(profile.acceleration_m_s2)).max() / PERIOD_S
     assert jerk <= 0.8 * 1.001  # as Q27 has it
+
+
+def test_over_a_hill_it_costs_what_dynamic_programming_finds_and_the_jerk_limit():
+    track = Track(
+        from_m=[0.0, 400.0, 800.0, 1200.0],
+        resistance_n_per_kn=[0.0, 18.0, -24.0, 0.0],
+        averaged_over_m=80.0,
+    )
+    speeds = [StaticSpeed(until_m=700.0, speed_m_s=18.0), StaticSpeed(until_m=2e3, speed_m_s=15.0)]
+    line = road(track, Atp(speeds=speeds, train_length_m=80.0))
+    a_train = train(constant=0.015, square=1e-4, power_w=900e3)
+    way = {"distance_m": 1500.0, "duration_s": 130.0}
+    _, profile = table(plan(**way), a_train, line)
+    traction_j, _ = work_j(profile, a_train, line)
+    moved, cells = least_energy.of_plan(plan(**way), a_train, line, 250)
+    # A second is what acceleration takes to build up; a run that has it less is as cheap.
+    least, less_a_second = (
+        least_energy.least_work_j_kg(moved, cells, duration_s, nodes=120) * 100e3
+        for duration_s in (130.0, 129.0)
+    )
+    assert 0.998 * least < traction_j < 1.01 * less_a_second
+    fastest, _ = table(plan(objective="time", distance_m=1500.0, duration_s=None), a_train, line)
+    least_s = least_energy.least_time_s(moved, cells)
+    assert least_s + 0.99 < fastest["ticks"].sum() * PERIOD_S < 1.005 * least_s + 1.2
 
 
 def test_more_time_never_costs_more():
