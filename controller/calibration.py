@@ -110,7 +110,6 @@ class GuardSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 class Line:
     """The place of a train on a line of several, and what it makes of its neighbours."""
 
-    start_m: float  # of its timetable against the common one
     spacing_m: float  # S0, to each neighbour
     ahead: bool  # there is a train ahead
     behind: bool
@@ -144,11 +143,12 @@ def calibrate(
     car_traction_max_n: Sequence[float] = (),
     car_brake_max_n: Sequence[float] = (),
     map_sections: Sequence[tuple[float, float, float]] = (),
+    start_m: float = 0.0,
     line: Line | None = None,
     scenario_digest: str,
 ) -> Calibration:
-    """PARAMS of the firmware for one law on one scenario. Raises CalibrationError or LawError with
-    one line."""
+    """PARAMS of the firmware for one law on one scenario; `start_m` is where the timetable starts.
+    Raises CalibrationError or LawError with one line."""
     known = load_law(law)
     params = np.zeros(1, firmware.params_dtype(known.PARAMS))
     params["core"] = _core(known, law, vehicle)
@@ -170,7 +170,6 @@ def calibrate(
         raise CalibrationError(f"laws.{law_label(law)}: {where}") from None
     params["gradient_map"] = gradient_map.calibrate(map_sections)
     params["guard"] = _guard(guard_settings, vehicle.period_s)
-    start_m = line.start_m if line else 0.0
     params["plausibility"] = _plausibility(
         guard_settings.plausible, vehicle.period_s, start_m, length_m(profile)
     )
@@ -182,7 +181,9 @@ def calibrate(
         memory_settings = MemorySettings()
     params["reference"] = _reference(vehicle.period_s, profile, preview_ticks)
     if line is not None:
-        _line(params, line, vehicle.period_s)
+        _line(params, line, start_m, vehicle.period_s)
+    else:
+        params["neighbours"]["start"] = fixed("the start of the timetable", start_m, Q_POSITION)
     params["memory"] = _memory(words, memory_settings, ticks)
     if recall is not None:
         _recall(params["memory"], recall)
@@ -316,12 +317,12 @@ def _links(settings: GuardSettings) -> tuple[np.ndarray, np.ndarray]:
     return every_tick, slow
 
 
-def _line(params: np.ndarray, line: Line, period_s: float) -> None:
+def _line(params: np.ndarray, line: Line, start_m: float, period_s: float) -> None:
     """PARAMS of what a train makes of its neighbours, in place."""
     params["neighbours"] = neighbours.calibrate(
         line.neighbours,
         period_s=period_s,
-        start_m=line.start_m,
+        start_m=start_m,
         ahead=line.ahead,
         behind=line.behind,
     )

@@ -528,7 +528,8 @@ def before_law(
     read_map(params, state)
     stands = int64(inputs.reference_speed) == 0 and int64(inputs.ahead_speed) == 0
     state.seen.timetable_stands = 1 if stands else 0
-    memory.gather(params.memory, state.memory, cells, state.cell, int64(inputs.position))
+    way = int64(inputs.position) - int64(params.neighbours.start)
+    memory.gather(params.memory, state.memory, cells, state.cell, way)
     return int64(1)
 
 

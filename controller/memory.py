@@ -200,8 +200,8 @@ def scatter_along(params: Record, state: Record, memory: Array, cell: Record) ->
 
 @step
 def gather(params: Record, state: Record, memory: Array, cell: Record, position: Int) -> None:
-    """`cell.before` for the current tick, with the train at `position` (m, Q15), and the read
-    position one tick on."""
+    """`cell.before` for the current tick, with the train at `position` (m, Q15) from the start of
+    the timetable, and the read position one tick on."""
     words = int64(params.words)
     if int64(params.pitch) > 0:
         gather_along(params, state, memory, cell, position)

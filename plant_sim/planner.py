@@ -31,6 +31,8 @@ Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Change = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+# As far as TRAIN_POSITION and the firmware's positions go, less what a train may be beyond a stop.
+Position = Annotated[float, msgspec.Meta(ge=-65e3, le=65e3)]
 
 DISTANCE_TOLERANCE_M = 1e-3
 SPEED_TOLERANCE_M_S = 1e-6  # rounding of levels, far below what a limit can mean
@@ -79,9 +81,20 @@ class Ramp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
             raise PlanError("a ramp needs acceleration_m_s2 and jerk_m_s3, or sinusoidal_s alone")
 
 
+class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A stop of a service."""
+
+    position_m: Position
+    name: str = ""
+    run_s: Positive | None = None  # from the stop before; none: the first, or objective "time"
+    dwell_s: NotNegative = 0.0  # from arrival to departure; of the last, to the end of the run
+    held_s: NotNegative = 0.0  # departs so much later than the timetable has it
+
+
 class ProfilePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A run from standstill to standstill, and what it has to keep: as `ramps` state it, or with an
-    `objective`, found by `running` from line, train and timetable."""
+    `objective`, found by `running` from line, train and timetable; with `stops` a whole service,
+    `service`."""
 
     objective: Literal["time", "energy"] | None = None
     duration_s: Positive | None = None  # none: that of least time, with objective "time"
@@ -91,6 +104,9 @@ class ProfilePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     max_deceleration_m_s2: Positive | None = None  # with an objective; none: as the acceleration
     max_jerk_m_s3: Positive
     ramps: tuple[Ramp, ...] = ()
+    stops: tuple[Stop, ...] = ()  # with an objective, instead of duration_s and distance_m
+    from_stop: int = 1  # the part of `stops` that is run; 1 is the first
+    to_stop: int | None = None  # none: the last
     # With an objective: part of the train's forces that it uses, the rest is for control; and part
     # of the braking work that counts as won back.
     force_share: Share = 0.9
@@ -106,10 +122,33 @@ class ProfilePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
             raise PlanError("a plan needs ramps and duration_s, or an objective")
         if self.objective is not None and (self.ramps or self.limits):
             raise PlanError("a plan with an objective takes neither ramps nor limits over time")
+        if self.stops or self.from_stop != 1 or self.to_stop is not None:
+            self._check_stops()
+            return
         if self.objective is not None and self.distance_m is None:
             raise PlanError("a plan with an objective needs distance_m")
         if self.objective and (self.objective == "time") != (self.duration_s is None):
             raise PlanError('duration_s: expected with objective "energy", not with "time"')
+
+    def _check_stops(self) -> None:
+        if self.objective is None:
+            raise PlanError("stops need an objective")
+        if self.distance_m is not None or self.duration_s is not None:
+            raise PlanError("a plan with stops takes neither duration_s nor distance_m")
+        if not 1 <= self.from_stop < (self.to_stop or len(self.stops)) <= len(self.stops):
+            raise PlanError(
+                f"from_stop = {self.from_stop}, to_stop = {self.to_stop or len(self.stops)}:"
+                f" expected two of the stops 1 to {len(self.stops)}, the first below the second"
+            )
+        for number, (before, stop) in enumerate(itertools.pairwise(self.stops), 1):
+            if stop.position_m <= before.position_m:
+                raise PlanError(f"stops[{number}].position_m: expected above {before.position_m:g}")
+            if (stop.run_s is None) != (self.objective == "time"):
+                raise PlanError(
+                    f'stops[{number}].run_s: expected with objective "energy", not with "time"'
+                )
+        if self.stops[0].run_s is not None:
+            raise PlanError("stops[0].run_s: the first stop has none before it")
 
 
 @dataclass(frozen=True)

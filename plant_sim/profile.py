@@ -91,6 +91,11 @@ def _profile(
     )
 
 
+def between(profile: Profile, first: int, last: int) -> Profile:
+    """The rows of the ticks from `first` to `last`."""
+    return Profile(**{name: column[first : last + 1] for name, column in vars(profile).items()})
+
+
 def displaced(profile: Profile, distance_m: float) -> Profile:
     """The profile with its start at `distance_m` instead of 0.
 

@@ -7,14 +7,15 @@ relative to the file that names it). `unset = ["control.guard.jerk_max_m_s3"]` t
 base away, so that their defaults count.
 
 One file may hold named cases: `[cases.VI]` states what that case replaces, and `gradient:VI` (or
-`my.toml:VI`) is the scenario with it.
+`my.toml:VI`) is the scenario with it. `yizhuang@3-6` is the part of a service from its third stop
+to its sixth.
 """
 
 from __future__ import annotations
 
 import copy
 import hashlib
-from dataclasses import replace
+import re
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +27,7 @@ import numpy as np
 
 from ato_hil.can_dbc import settings
 from ato_hil.can_dbc.errors import InputError, expected, validation
-from ato_hil.plant_sim import fits
+from ato_hil.plant_sim import fits, service
 from ato_hil.plant_sim.actuator import Actuator
 from ato_hil.plant_sim.atp import Atp
 from ato_hil.plant_sim.atp_tables import braking_fault
@@ -34,6 +35,7 @@ from ato_hil.plant_sim.line import Line
 from ato_hil.plant_sim.planner import PlanError, ProfilePlan, plan_profile
 from ato_hil.plant_sim.profile import (
     Profile,
+    between,
     displaced,
     evaluate,
     rate_of,
@@ -203,17 +205,19 @@ class Loaded(msgspec.Struct, frozen=True):
     profile: Profile  # of this train, as planned or at `timetable_rate`
     train: int = 0  # place on the line, 0 leads
     timetable_rate: int = 0  # of a run against the planned one, less 1, 2^-24
+    calls: tuple[service.Call, ...] = ()  # of a service, the first is its departure
+    part: str = ""  # of a service, as its name has it: @3-6
 
     @property
     def folder_name(self) -> str:
         """The name as part of a folder's."""
-        return self.name.replace(":", "-")
+        return self.name.replace(":", "-").replace("@", "-")
 
     @property
     def source(self) -> str:
         """What loads this scenario in another process."""
         path = str(self.path.absolute())
-        return f"{path}:{self.case}" if self.case else path
+        return (f"{path}:{self.case}" if self.case else path) + self.part
 
     @property
     def ticks(self) -> int:
@@ -228,6 +232,8 @@ class Loaded(msgspec.Struct, frozen=True):
     @property
     def start_m(self) -> float:
         """Where this train's reference starts."""
+        if self.calls:
+            return self.calls[0].position_m
         return -self.train * self.scenario.line.spacing_m if self.scenario.line else 0.0
 
 
@@ -245,9 +251,49 @@ def case_names() -> list[str]:
     ]
 
 
+PART = re.compile(r"@([0-9]+)-([0-9]+)$")
+
+
+def part_of(name: str) -> str:
+    """What a name says of the part of a service, as @3-6; "" if nothing."""
+    found = PART.search(name)
+    return found.group() if found and not Path(name).is_file() else ""
+
+
+def with_part(name: str, first: str | None, last: str | None) -> str:
+    """The name of a part of a service, from a stop to another, each by name or number, None: the
+    scenario's own. Raises ScenarioError."""
+    if part_of(name):
+        raise ScenarioError(f"{name}: names a part already")
+    path, case = find(name)
+    profile = _in_case(path, case, _content(path)).get("profile", {})
+    stops = profile.get("stops", []) if isinstance(profile, dict) else []
+    if not isinstance(stops, list) or not all(isinstance(stop, dict) for stop in stops):
+        stops = []
+    if not stops:
+        raise ScenarioError(f"{_place(path, case)}: no service, expected profile.stops")
+    names = [str(stop.get("name", "")) for stop in stops]
+
+    def number(text: str) -> int:
+        if text.isdecimal() and 1 <= int(text) <= len(names):
+            return int(text)
+        if text and names.count(text) == 1:
+            return names.index(text) + 1
+        known = expected(text, [each for each in names if each])
+        raise ScenarioError(
+            f"{_place(path, case)}: stop {text!r} is unknown, expected 1 to {len(names)} or the"
+            f" name of one, {known}"
+        )
+
+    a = profile.get("from_stop", 1) if first is None else number(first)
+    b = profile.get("to_stop", len(stops)) if last is None else number(last)
+    return f"{name}@{a}-{b}"
+
+
 def find(name: str) -> tuple[Path, str]:
     """File of a scenario, by name or path, and its case, "" for none. Raises ScenarioError if there
     is no such file."""
+    name = name.removesuffix(part_of(name))
     file, separator, case = name.rpartition(":")
     if not separator or Path(name).is_file():
         file, case = name, ""
@@ -385,6 +431,9 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
     cases = tuple(_cases(path, content))
     content = _merged(_in_case(path, case, content), overlay)
     content.pop("cases", None)
+    part = part_of(name)
+    if part:
+        content = _in_part(_place(path, case), content, part)
     try:
         scenario = msgspec.convert(content, Scenario)
     except msgspec.ValidationError as error:
@@ -393,22 +442,12 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
     if strange:
         raise ScenarioError(f"{_place(path, case)}: key {strange.key}: {strange.text}")
     _check(_place(path, case), scenario)
+    digest = hashlib.blake2b(msgspec.json.encode(content, order="deterministic"), digest_size=16)
+    full = (f"{path.stem}:{case}" if case else path.stem) + part
     try:
-        segments = planned(scenario)
-        profile = evaluate(segments, scenario.period_s)
+        loaded = assembled(full, path, case, cases, digest.hexdigest(), scenario)
     except (PlanError, ValueError) as error:
         raise ScenarioError(f"{_place(path, case)}: [profile]: {error}") from None
-    digest = hashlib.blake2b(msgspec.json.encode(content, order="deterministic"), digest_size=16)
-    loaded = Loaded(
-        f"{path.stem}:{case}" if case else path.stem,
-        path,
-        case,
-        cases,
-        digest.hexdigest(),
-        scenario,
-        segments,
-        profile,
-    )
     place = _place(path, case)
     for change in (0, *(change.from_run for change in scenario.changes)):
         for each in members(loaded):  # so that a wrong one is refused here
@@ -432,13 +471,43 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
     return loaded
 
 
+def assembled(
+    name: str, path: Path, case: str, cases: tuple[str, ...], digest: str, scenario: Scenario
+) -> Loaded:
+    """A validated scenario, planned. Raises PlanError, ValueError."""
+    segments, calls = _planned(scenario)
+    profile = evaluate(segments, scenario.period_s)
+    if calls:
+        profile = displaced(profile, calls[0].position_m)
+    return Loaded(
+        name, path, case, cases, digest, scenario, segments, profile,
+        calls=calls, part=part_of(name),
+    )  # fmt: skip
+
+
 def planned(scenario: Scenario) -> np.ndarray:
     """The reference's table, as the plan states it or as its objective asks."""
-    if scenario.profile.objective is None:
-        return plan_profile(scenario.profile, scenario.period_s)
+    return _planned(scenario)[0]
+
+
+def _planned(scenario: Scenario) -> tuple[np.ndarray, tuple[service.Call, ...]]:
+    """The reference's table, and the stops of a service."""
+    plan, period_s = scenario.profile, scenario.period_s
+    if plan.objective is None:
+        return plan_profile(plan, period_s), ()
     assert isinstance(scenario.train, point.Train)
     line = road(scenario.track, scenario.atp)
-    return plan_running(scenario.profile, scenario.period_s, scenario.train, line)
+    if plan.stops:
+        return service.plan_service(plan, period_s, scenario.train, line)
+    return plan_running(plan, period_s, scenario.train, line), ()
+
+
+def _in_part(place: str, content: dict[str, Any], part: str) -> dict[str, Any]:
+    """`content` of a service, of which `part` is run."""
+    if not content.get("profile", {}).get("stops"):
+        raise ScenarioError(f"{place}{part}: expected a service, with profile.stops")
+    first, last = PART.fullmatch(part).groups()  # type: ignore[union-attr]
+    return _merged(content, {"profile": {"from_stop": int(first), "to_stop": int(last)}})
 
 
 def at_rate(loaded: Loaded, rate: int) -> Loaded:
@@ -574,6 +643,15 @@ def _check(path: str, scenario: Scenario, under: str = "") -> None:
         raise ScenarioError(f"{path}: key changes: expected from_run to rise")
     if scenario.profile.objective and not isinstance(scenario.train, point.Train):
         raise ScenarioError(f"{path}: key {under}profile.objective: expected train model 'point'")
+    if scenario.profile.stops:
+        if getattr(scenario.train, "start_m", 0.0):
+            raise ScenarioError(
+                f"{path}: key {under}train.start_m: a service starts at its first stop,"
+                " expected start.offsets_m instead"
+            )
+        for key, value in (("line", scenario.line), ("run_length", scenario.run_length)):
+            if value is not None:
+                raise ScenarioError(f"{path}: key {under}{key}: a service, profile.stops, has none")
     has_limits = scenario.profile.limits or scenario.profile.limit_above_m_s is not None
     if not has_limits and not scenario.atp.speeds:
         raise ScenarioError(f"{path}: key {under}profile.limits: expected at least one limit")
@@ -586,10 +664,4 @@ def shortened(loaded: Loaded, ticks: int) -> Loaded:
     """The scenario's first `ticks` control periods; 0 or more than it has: all."""
     if not 0 < ticks < loaded.ticks:
         return loaded
-    profile = loaded.profile
-    arrays = {
-        name: value[:ticks]
-        for name, value in vars(profile).items()
-        if isinstance(value, np.ndarray) and len(value) == loaded.ticks
-    }
-    return msgspec.structs.replace(loaded, profile=replace(profile, **arrays))
+    return msgspec.structs.replace(loaded, profile=between(loaded.profile, 0, ticks - 1))

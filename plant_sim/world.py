@@ -131,6 +131,8 @@ def _params(loaded: Loaded, model: Any, offset_m: float = 0.0) -> np.ndarray:
     smeared = scenario.track.application == "smeared"
     params = np.zeros(1, plant.params_dtype(model.PARAMS))
     params["train"] = model.calibrate(train, scenario.period_s, smeared)
+    if loaded.calls:
+        offset_m += loaded.start_m
     params["train"]["start_m"] += offset_m
     params["actuator"] = actuator.calibrate(
         scenario.actuator, train.mass_kg, scenario.period_s, scenario.period_s / train.substeps

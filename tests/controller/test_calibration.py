@@ -148,8 +148,10 @@ def test_positions_are_believed_around_the_timetable():
     believed = calibrate(guard_settings=settings).params[0]["plausibility"]
     assert believed["position_min"] == -100 * 2**15
     assert believed["position_max"] == round((length + 100) * 2**15)
-    own = Line(-500.0, 500.0, True, True, NeighbourSettings())
-    believed = calibrate(guard_settings=settings, line=own).params[0]["plausibility"]
+    own = Line(500.0, True, True, NeighbourSettings())
+    believed = calibrate(guard_settings=settings, start_m=-500.0, line=own).params[0][
+        "plausibility"
+    ]
     assert believed["position_min"] == -600 * 2**15
     believed = calibrate().params[0]["plausibility"]
     assert (believed["position_min"], believed["position_max"]) == (-(2**31), 2**31 - 1)
@@ -258,7 +260,6 @@ def test_cars_get_their_distribution():
 def line(**changes):
     rebasing = {"error_max_m": 0.15, "l1_m": 400.0, "l2_m": 600.0, "speed_max_m_s": 24.0}
     settings = {
-        "start_m": -1000.0,
         "spacing_m": 500.0,
         "ahead": True,
         "behind": False,
@@ -269,7 +270,7 @@ def line(**changes):
 
 
 def test_a_train_of_a_line_knows_its_place():
-    params = calibrate(line=line()).params[0]
+    params = calibrate(start_m=-1000.0, line=line()).params[0]
     assert params["neighbours"]["exists"].tolist() == [1, 0]
     assert params["neighbours"]["start"] == -1000 * 2**15
     assert params["neighbours"]["age_max"] == 150
@@ -278,12 +279,18 @@ def test_a_train_of_a_line_knows_its_place():
 
 
 def test_a_train_that_may_not_re_base_and_one_alone():
-    params = calibrate(line=Line(0.0, 500.0, False, True, NeighbourSettings())).params[0]
+    params = calibrate(line=Line(500.0, False, True, NeighbourSettings())).params[0]
     assert params["rebasing"]["enabled"] == 0
     assert params["neighbours"]["exists"].tolist() == [0, 1]
     alone = calibrate().params
     assert not np.any(alone["neighbours"].view(np.uint8))
     assert not np.any(alone["rebasing"].view(np.uint8))
+
+
+def test_a_start_outside_of_what_positions_hold_is_refused():
+    outside = "-100000 is outside what the firmware holds, +-65536"
+    assert refusal(start_m=-1e5, line=line()) == f"line.start_m: {outside}"
+    assert refusal(start_m=-1e5) == f"the start of the timetable: {outside}"
 
 
 @pytest.mark.parametrize(
@@ -293,7 +300,6 @@ def test_a_train_that_may_not_re_base_and_one_alone():
             {"neighbours": NeighbourSettings(age_max_s=9.0)},
             "control.neighbours.age_max_s is 9, expected 0.01 to 2.55",
         ),
-        ({"start_m": -1e5}, "line.start_m: -100000 is outside what the firmware holds, +-65536"),
         (
             {"rebasing": {"error_max_m": 1e5}},
             "control.rebasing: error_max: 100000 is outside what the firmware holds, +-65536",

@@ -119,6 +119,7 @@ def calibrated(line=None, guard_settings=None):
         motor_cars=[1, 3],
         car_traction_max_n=[],
         car_brake_max_n=[],
+        start_m=0.0 if line is None else -SPACING_M,
         line=line,
         scenario_digest="d" * 32,
     )
@@ -132,7 +133,6 @@ def built():
 
 SPACING_M = 500.0
 SECOND_OF_THREE = Line(
-    start_m=-SPACING_M,
     spacing_m=SPACING_M,
     ahead=True,
     behind=True,

@@ -131,6 +131,7 @@ def measure(point: Point) -> dict[str, Any]:
     *_, last = job.runs(point.job)
     row = {"run": last.number, **last.metrics}
     row.pop("trains", None)
+    row.pop("stops", None)
     faults = (name for names in last.faults for name in names)
     row["faults"] = ", ".join(dict.fromkeys(faults))
     return {**{key: _plain(value) for key, value in point.values.items()}, **row}

@@ -38,6 +38,21 @@ LINE_COLUMNS = (
     COLUMNS[-1],
 )
 
+# The same of a service, whose rows are its stops.
+SERVICE_COLUMNS = (
+    COLUMNS[0],
+    ("stop", "stop", 1, "{:d}"),
+    ("late\ns", "arrival_late_s", 1, "{:.2f}"),
+    ("stop error\nmm", "stop_error_m", 1e3, "{:.2f}"),
+    ("position error\nmm", "max_position_error_m", 1e3, "{:.1f}"),
+    ("margin to limit\nm/s", "overspeed_margin_m_s", 1, "{:.3f}"),
+    ("traction\nkWh", "traction_kwh", 1, "{:.2f}"),
+    ("recuperated\nkWh", "recuperated_kwh", 1, "{:.2f}"),
+    ("jerk\nm/s³", "max_jerk_m_s3", 1, "{:.2f}"),
+    ("stood\ns", "stood_s", 1, "{:.1f}"),
+    COLUMNS[-1],
+)
+
 # The columns that do not tell how fast the bench was, and the comfort.
 COMPARED = (*COLUMNS[:-1], ("rms jerk\nm/s³", "rms_command_jerk_m_s3", 1, "{:.3f}"))
 
@@ -55,12 +70,18 @@ SWEPT = (
 
 
 def columns_of(row: dict[str, Any]) -> tuple[tuple[str, str, float, str], ...]:
-    """The columns for a row of a session: of one train or of a line."""
+    """The columns for a row of a session: of one train, of a line or of a service."""
+    if row.get("stops"):
+        return SERVICE_COLUMNS
     return LINE_COLUMNS if "trains" in row else COLUMNS
 
 
 def shown_rows(row: dict[str, Any]) -> list[dict[str, Any]]:
-    """The rows of the table for a run: one, or one for each train."""
+    """The rows of the table for a run: one, or one for each train or stop; faults are of the run,
+    so the last stop has them."""
+    if row.get("stops"):
+        *others, last = ({**row, **of_stop} for of_stop in row["stops"])
+        return [*({**other, "faults": []} for other in others), last]
     return [{**row, **of_train} for of_train in row.get("trains", [{}])]
 
 

@@ -92,7 +92,8 @@ def plan(
     scenario: ScenarioName,
     out: Annotated[Path | None, typer.Option(help="Picture to write: .png, .svg or .pdf.")] = None,
 ) -> None:
-    """Print time, energy and top speed of a plan, and draw its speed over position."""
+    """Print time, energy and top speed of a plan, of a service by section, and draw its speed over
+    position."""
     with one_line_for_bad_input():
         from ato_hil.plant_sim.scenario import load
         from ato_hil.tools.lines import make, plans
@@ -101,11 +102,11 @@ def plan(
         if kind not in ("png", "svg", "pdf"):
             raise fail(f"--out {out}: expected .png, .svg or .pdf", EXIT_BAD_INPUT)
         loaded = load(scenario)
-        row = plans.section(loaded)
+        rows = plans.sections(loaded)
         if out:
             make.write_bytes(out, plans.picture(loaded, kind))
-    least = "" if row.least_time_s is None else f"{row.least_time_s:.2f}"
     headings = (
+        "from m",
         "length m",
         "time s",
         "least time s",
@@ -113,10 +114,14 @@ def plan(
         "braking kWh",
         "top speed m/s",
     )
-    cells = (
-        f"{row.length_m:.1f}", f"{row.time_s:.2f}", least, f"{row.traction_kwh:.3f}",
-        f"{row.braking_kwh:.3f}", f"{row.top_speed_m_s:.2f}",
-    )  # fmt: skip
-    show(console, [Column(heading) for heading in headings], [Row(cells)])
+    cells = [
+        Row((
+            f"{row.from_m:.0f}", f"{row.length_m:.1f}", f"{row.time_s:.2f}",
+            "" if row.least_time_s is None else f"{row.least_time_s:.2f}",
+            f"{row.traction_kwh:.3f}", f"{row.braking_kwh:.3f}", f"{row.top_speed_m_s:.2f}",
+        ))
+        for row in rows
+    ]  # fmt: skip
+    show(console, [Column(heading) for heading in headings], cells)
     if out:
         say(f"picture  {out}")

@@ -63,6 +63,16 @@ DEFAULT_BOARD = BoardName(boards.DEFAULT)
 ScenarioName = Annotated[
     str, typer.Argument(metavar="SCENARIO", help="Name of a scenario or a .toml file.")
 ]
+FromStop = Annotated[
+    str | None,
+    typer.Option(
+        "--from", metavar="STOP", help="Of a service: begin at this stop, name or number."
+    ),
+]
+ToStop = Annotated[
+    str | None,
+    typer.Option("--to", metavar="STOP", help="Of a service: last stop, name or number."),
+]
 LawName = Annotated[str | None, typer.Option(help="Control law; the scenario's by default.")]
 Runs = Annotated[int | None, typer.Option(min=1, help="Runs in a row; the scenario's by default.")]
 SEED_MAX = 2**63 - 1  # what every generator takes as it is

@@ -28,12 +28,14 @@ from ato_hil.tools.cli.options import (
     DEFAULT_BOARD,
     BoardName,
     External,
+    FromStop,
     LawName,
     Mode,
     Overwrite,
     Pace,
     Runs,
     Seed,
+    ToStop,
     Trace,
     Viewer,
 )
@@ -154,6 +156,8 @@ def run(
     ],
     law: LawName = None,
     runs: Runs = None,
+    from_stop: FromStop = None,
+    to_stop: ToStop = None,
     mode: Annotated[
         Mode,
         typer.Option(
@@ -242,9 +246,12 @@ def run(
 ) -> None:
     """Run a scenario: the train follows its profile, run by run."""
     with one_line_for_bad_input(), ExitStack() as stack:
+        from ato_hil.plant_sim.scenario import load, with_part
         from ato_hil.tools.session.session import Options
         from ato_hil.tools.trace.budget import BYTES_OF_TICK
 
+        if from_stop is not None or to_stop is not None:
+            scenario = with_part(scenario, from_stop, to_stop)
         expected = [parse(text) for text in expect or ()]
         nodes = tuple(dict.fromkeys(node.value for node in external or ()))
         viewer = None
@@ -253,7 +260,6 @@ def run(
                 raise fail("--view shows the trace, so not with --no-trace", EXIT_BAD_INPUT)
             viewer = stack.enter_context(LiveView(view.value))
         if mode is Mode.pil and firmware is None:
-            from ato_hil.plant_sim.scenario import load
             from ato_hil.tools.export import image
 
             firmware = stack.enter_context(

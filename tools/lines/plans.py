@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import io
+from itertools import pairwise
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from matplotlib.figure import Figure
 
+from ato_hil.plant_sim import service
 from ato_hil.plant_sim.planner import PlanError
+from ato_hil.plant_sim.profile import between
 from ato_hil.plant_sim.running import gradient_m_s2, plan_running, road, work_j
 from ato_hil.plant_sim.scenario import Loaded
 from ato_hil.plant_sim.trains import point
@@ -23,6 +25,7 @@ JOULES_A_KWH = 3.6e6
 class Section(NamedTuple):
     """A run from stop to stop, driven exactly as planned."""
 
+    from_m: float
     length_m: float
     time_s: float
     least_time_s: float | None  # none: the plan has no objective
@@ -31,27 +34,38 @@ class Section(NamedTuple):
     top_speed_m_s: float
 
 
-def section(loaded: Loaded) -> Section:
-    """The plan of a scenario in numbers. Raises LineError for a train of several cars."""
+def sections(loaded: Loaded) -> list[Section]:
+    """The plan of a scenario in numbers, a row a section. Raises LineError for a train of several
+    cars."""
+    if not loaded.calls:
+        return [_section(loaded, 0, loaded.ticks - 1)]
+    return [_section(loaded, a.departure, b.arrival) for a, b in pairwise(loaded.calls)]
+
+
+def _section(loaded: Loaded, first: int, last: int) -> Section:
+    """That from tick `first` to tick `last` of the reference."""
     train, plan = _train(loaded), loaded.scenario.profile
     line = road(loaded.scenario.track, loaded.scenario.atp)
+    profile, period_s = between(loaded.profile, first, last), loaded.scenario.period_s
+    from_m = float(profile.position_m[0])
+    length_m = float(profile.position_m[-1]) - from_m
     least_s = None
     if plan.objective is not None:
-        fastest = msgspec.structs.replace(plan, objective="time", duration_s=None)
-        period_s = loaded.scenario.period_s
+        fastest = service.section_of(plan, length_m, None)
         try:
-            table = plan_running(fastest, period_s, train, line)
+            table = plan_running(fastest, period_s, train, service.from_place(line, from_m))
         except PlanError as error:
             raise LineError(f"{loaded.path}: [profile]: {error}") from None
         least_s = float(table["ticks"].sum()) * period_s
-    traction_j, braking_j = work_j(loaded.profile, train, line)
+    traction_j, braking_j = work_j(profile, train, line)
     return Section(
-        float(loaded.profile.position_m[-1]),
-        (loaded.ticks - 1) * loaded.scenario.period_s,
+        from_m,
+        length_m,
+        (last - first) * period_s,
         least_s,
         traction_j / JOULES_A_KWH,
         braking_j / JOULES_A_KWH,
-        float(loaded.profile.speed_m_s.max()),
+        float(profile.speed_m_s.max()),
     )
 
 
@@ -77,7 +91,9 @@ def picture(loaded: Loaded, kind: str) -> bytes:
     above.set_ylim(bottom=0)
     above.legend(loc="lower center", ncols=2, fontsize=8)
     above.set_title(loaded.scenario.title, fontsize=9)
-    place = np.linspace(0.0, profile.position_m[-1], 2000)
+    for call in loaded.calls:
+        above.axvline(call.position_m / 1e3, color="0.6", linewidth=0.6)
+    place = np.linspace(profile.position_m[0], profile.position_m[-1], 2000)
     share = gradient_m_s2(road(loaded.scenario.track, loaded.scenario.atp).track, place)
     share = share / GRAVITY_M_S2
     rise = np.concatenate([[0.0], np.cumsum((share[1:] + share[:-1]) / 2 * np.diff(place))])

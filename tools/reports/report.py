@@ -103,14 +103,17 @@ def _ended(summary: dict[str, Any]) -> str:
 
 
 def _runs(rows: list[dict[str, Any]]) -> str:
-    """A row for each run, and of a line the trains of the last one."""
+    """A row for each run, and of a line or a service the trains or stops of the last one."""
     if not rows:
         return "<p>No run was completed.</p>"
     parts = [_table([_plain(row) for row in rows])]
-    trains = rows[-1].get("trains")
+    trains, stops = rows[-1].get("trains"), rows[-1].get("stops")
     if trains:
         parts.append(f"<h3>Trains of run {rows[-1]['run']}</h3>")
         parts.append(_table([_plain(row) for row in trains]))
+    if stops:
+        parts.append(f"<h3>Stops of run {rows[-1]['run']}</h3>")
+        parts.append(_table(stops))
     return "\n".join(parts)
 
 
@@ -141,7 +144,7 @@ def _others(rows: list[dict[str, Any]], summary: dict[str, Any]) -> list[str]:
         key
         for row in rows
         for key, value in row.items()
-        if isinstance(value, dict | list) and key not in ("faults", "trains")
+        if isinstance(value, dict | list) and key not in ("faults", "trains", "stops")
     )
     for key in keys:
         entries = [{"run": row["run"], **entry} for row in rows for entry in _entries(row.get(key))]

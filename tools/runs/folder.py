@@ -17,10 +17,9 @@ import numpy as np
 
 from ato_hil.can_dbc.errors import InputError
 from ato_hil.can_dbc.faults import Event
-from ato_hil.plant_sim.planner import plan_profile
 from ato_hil.plant_sim.plant import TRUTH
-from ato_hil.plant_sim.profile import Profile, evaluate
-from ato_hil.plant_sim.scenario import Loaded, Scenario, members
+from ato_hil.plant_sim.profile import Profile
+from ato_hil.plant_sim.scenario import Loaded, Scenario, assembled, members, part_of
 from ato_hil.tools.runs.frames import FRAME
 from ato_hil.tools.runs.result import Run, Runs
 
@@ -100,14 +99,9 @@ class Folder:
     @cached_property
     def loaded(self) -> Loaded:
         """The scenario as it was loaded then."""
-        period_s = self.scenario.period_s
-        segments = plan_profile(self.scenario.profile, period_s)
         digest = str(self.summary.get("scenario_digest", ""))
         file = self.path / "summary.json"
-        return Loaded(
-            *(self.name, file, self.case, (), digest, self.scenario),
-            *(segments, evaluate(segments, period_s)),
-        )
+        return assembled(self.name, file, self.case, (), digest, self.scenario)
 
     @property
     def _thinned(self) -> list[int]:
@@ -161,7 +155,7 @@ class Folder:
     @property
     def case(self) -> str:
         """Of the scenario, "" for none."""
-        return self.name.partition(":")[2]
+        return self.name.removesuffix(part_of(self.name)).partition(":")[2]
 
     @property
     def law(self) -> str:

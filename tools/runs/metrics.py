@@ -14,6 +14,7 @@ import numpy as np
 
 from ato_hil.plant_sim.atp import EMERGENCY_BRAKE, SERVICE_BRAKE
 from ato_hil.plant_sim.scenario import Loaded
+from ato_hil.tools.runs import stops
 
 STOPPED_M_S = 0.1  # below it a train counts as stopped at the end of its run
 
@@ -45,7 +46,7 @@ def run_metrics(
     margin = np.min(truth["permitted_speed_m_s"] - truth["speed_m_s"])
     stopped = abs(truth["speed_m_s"][-1]) < STOPPED_M_S
     jerk = np.diff(command_n) / (mass * scenario.period_s)
-    row = {
+    row: dict[str, Any] = {
         "ticks": ticks,
         "max_delta_m_s": None if alpha is None else _peak(alpha * e + ed),
         "max_speed_error_m_s": _peak(ed),
@@ -65,6 +66,9 @@ def run_metrics(
     }
     if scenario.atp.supervision != "none":
         row |= supervision(truth)
+    if loaded.calls:
+        rows = stops.stop_rows(loaded, truth)
+        row |= {**stops.worst(rows), "stops": rows}
     return row
 
 

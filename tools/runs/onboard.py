@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from ato_hil.can_dbc.errors import expected, validation
 from ato_hil.controller.calibration import (
@@ -58,7 +59,8 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
             motor_cars=list(scenario.train.motor_cars),
             car_traction_max_n=scenario.train.traction_max_n,
             car_brake_max_n=scenario.train.brake_max_n,
-            map_sections=_map_sections(scenario),
+            map_sections=_map_sections(loaded),
+            start_m=loaded.start_m,
             line=_line(loaded),
             scenario_digest=loaded.digest,
         )
@@ -92,7 +94,6 @@ def _line(loaded: Loaded) -> Line | None:
     if line is None:
         return None
     return Line(
-        start_m=loaded.start_m,
         spacing_m=line.spacing_m,
         ahead=loaded.train > 0,
         behind=loaded.train + 1 < line.trains,
@@ -129,18 +130,25 @@ def _characteristic(scenario: Scenario) -> Characteristic | None:
     return Characteristic(known.force_n, known.slope_n_s_m, known.power_w)
 
 
-def _map_sections(scenario: Scenario) -> list[tuple[float, float, float]]:
-    """The onboard gradient map: the track's own sections, as far as `control.map_share` says."""
+def _map_sections(loaded: Loaded) -> list[tuple[float, float, float]]:
+    """The onboard gradient map: the track's own sections, as far as `control.map_share` says; of a
+    service those of its way."""
+    scenario = loaded.scenario
     factor = scenario.control.map_share * GRAVITY_M_S2 * N_PER_KN
     if factor == 0:
         return []
+    sections = track.sections(track.known(scenario.track))[1:]
+    if loaded.calls:
+        ends = np.append(sections["from_m"][1:], np.inf)
+        first, last = loaded.calls[0].position_m, loaded.calls[-1].position_m
+        sections = sections[(ends > first) & (sections["from_m"] < last)]
     return [
         (
             float(section["from_m"]),
             factor * float(section["resistance_n_per_kn"]),
             factor * float(section["slope_n_per_kn_m"]),
         )
-        for section in track.sections(track.known(scenario.track))[1:]
+        for section in sections
     ]
 
 

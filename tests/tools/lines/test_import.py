@@ -201,7 +201,7 @@ def test_an_imported_run_is_driven_without_a_fault_by_every_law(folder):
 def test_the_plan_of_an_imported_run_is_printed_and_drawn(folder):
     out, result = _import(folder, "--journey", str(folder / "journey.json"), "--from", "2")
     assert result.exit_code == 0, result.output
-    row = plans.section(load(str(out)))
+    (row,) = plans.sections(load(str(out)))
     assert row.time_s == pytest.approx(80.0)
     assert row.least_time_s < row.time_s
     assert row.traction_kwh > 0
@@ -215,7 +215,7 @@ def test_the_plan_of_an_imported_run_is_printed_and_drawn(folder):
 def test_without_a_time_the_run_takes_a_tenth_more_than_the_least(folder):
     out, result = _import(folder)
     assert result.exit_code == 0, result.output
-    row = plans.section(load(str(out)))
+    (row,) = plans.sections(load(str(out)))
     assert 1.1 * row.least_time_s <= row.time_s < 1.1 * row.least_time_s + 1
 
 
