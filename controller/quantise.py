@@ -36,6 +36,7 @@ class Vehicle:
     period_s: float  # control period
     force_max_m_s2: float  # largest specific force of the actuators
     characteristic: Characteristic | None = None
+    reaction_s: float = 0.0  # from a command to its force: delay and lag of the actuators
 
 
 @dataclass(frozen=True)

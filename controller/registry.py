@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ato_hil.can_dbc.codec import choices
@@ -66,6 +67,14 @@ def is_file(name: str) -> bool:
 def law_label(name: str) -> str:
     """What a law is called where its path says nothing: in gains tables, folders, memory files."""
     return Path(name).stem.replace("_", "-") if is_file(name) else name
+
+
+def has_defaults(name: str) -> bool:
+    """Whether a law of ours has a default for every gain. A name that no law has does not."""
+    if name not in law_names():
+        return False
+    fields = msgspec.structs.fields(load_law(name).Gains)
+    return not any(field.required for field in fields)
 
 
 def load_law(name: str) -> Law:

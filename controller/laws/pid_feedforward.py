@@ -3,6 +3,17 @@
     e = x - x*,   ed = v - v*
     u = m (-kp e - kd ed - ki sum(e Ts) + ff (a* + w(x)))
 
+Gains that are not given follow from the reaction of the train: SIMC (S. Skogestad, Simple analytic
+rules for model reduction and PID controller tuning, J. Process Control 13, 2003, table 1, double
+integrating process, tau_c = theta), made parallel. The force that answers a command moves the
+position through 1/s^2; what is between them counts as dead time:
+
+    theta = max(delay + lag + 1.5 Ts, 10 Ts)
+    kp = 1/(8 theta^2),   kd = 1/(2 theta),   ki = 1/(128 theta^3),   m = M
+
+delay and lag are those of the actuators (the larger lag), 1.5 Ts is for sampling and hold, and ten
+periods keep a train that reacts at once from gains that only amplify the sensors' noise.
+
 a* may be previewed, w is what the onboard gradient map says. e is clamped to z1_max_m; meanwhile
 the integral is held, as it is where it would push a limited command further. Everything is divided
 by the mass M: f = u/M.
@@ -15,6 +26,8 @@ by the mass M: f = u/M.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -67,24 +80,47 @@ ESTIMATES = (("integral", "m ticks", 16),)
 
 
 class Gains(TrackGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Gains for each kilogram, and the mass that the law takes the train to have."""
+    """Gains for each kilogram, and the mass that the law takes the train to have; what is not given
+    follows from the train."""
 
-    kp: NotNegative  # 1/s^2
-    ki: NotNegative  # 1/s^3
-    kd: NotNegative  # 1/s
+    kp: NotNegative | None = None  # 1/s^2
+    ki: NotNegative | None = None  # 1/s^3
+    kd: NotNegative | None = None  # 1/s
     feed_forward: NotNegative = 1.0
-    mass_t: Positive
+    mass_t: Positive | None = None
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Gains, all of them."""
+
+    kp: float  # 1/s^2
+    ki: float  # 1/s^3
+    kd: float  # 1/s
+    mass_kg: float
+
+
+def tuned(gains: Gains, vehicle: Vehicle) -> Tuned:
+    """What is given, and by the rule above what is not."""
+    theta = max(vehicle.reaction_s + 1.5 * vehicle.period_s, 10 * vehicle.period_s)
+    return Tuned(
+        kp=1 / (8 * theta**2) if gains.kp is None else gains.kp,
+        ki=1 / (128 * theta**3) if gains.ki is None else gains.ki,
+        kd=1 / (2 * theta) if gains.kd is None else gains.kd,
+        mass_kg=vehicle.mass_kg if gains.mass_t is None else gains.mass_t * 1000,
+    )
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
     """PARAMS, shape (1,). Raises CalibrationError where a gain does not fit its format."""
+    chosen = tuned(gains, vehicle)
     params = np.zeros(1, PARAMS)
     params["track"] = calibrate_track(gains, vehicle)
-    params["kp"] = fixed("kp", gains.kp, 24)
-    params["ki"] = fixed("ki Ts", gains.ki * vehicle.period_s, 28, 26)
-    params["kd"] = fixed("kd", gains.kd, 24)
+    params["kp"] = fixed("kp", chosen.kp, 24)
+    params["ki"] = fixed("ki Ts", chosen.ki * vehicle.period_s, 28, 26)
+    params["kd"] = fixed("kd", chosen.kd, 24)
     params["feed_forward"] = fixed("feed_forward", gains.feed_forward, 30)
-    params["mu"] = fixed("mass_t / M", gains.mass_t * 1000 / vehicle.mass_kg, 29)
+    params["mu"] = fixed("mass_t / M", chosen.mass_kg / vehicle.mass_kg, 29)
     return params
 
 

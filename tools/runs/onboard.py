@@ -21,6 +21,7 @@ from ato_hil.controller.node import Controller, build
 from ato_hil.controller.quantise import CalibrationError, Characteristic, Vehicle
 from ato_hil.controller.rebasing import RebasingSettings
 from ato_hil.controller.registry import (
+    has_defaults,
     is_file,
     law_label,
     law_names,
@@ -37,11 +38,11 @@ EXTERNAL_LAW = "external"  # of a controller that is not ours
 def calibration_for(loaded: Loaded, law: str) -> Calibration:
     """What the controller is flashed with for one law. Raises ScenarioError with file and key.
 
-    A law in a file of its own may do without a table of gains: its defaults count.
+    A law that has a default for every gain may do without a table of gains.
     """
     scenario = loaded.scenario
     _check_law_names(loaded, law)
-    gains = scenario.laws.get(law_label(law), {} if is_file(law) else None)
+    gains = scenario.laws.get(law_label(law), {} if is_file(law) or has_defaults(law) else None)
     if gains is None:
         known = expected(law, sorted(scenario.laws))
         raise ScenarioError(f"{loaded.path}: no gains for law {law!r}, {known}")
@@ -114,7 +115,15 @@ def vehicle(scenario: Scenario) -> Vehicle:
         scenario.period_s,
         scenario.actuator.force_max_m_s2,
         _characteristic(scenario),
+        _reaction_s(scenario),
     )
+
+
+def _reaction_s(scenario: Scenario) -> float:
+    """From a command to its force: the slower of traction and brake."""
+    actuator = scenario.actuator
+    lag_s = max(actuator.lag_traction_s, actuator.lag_brake_s)
+    return actuator.delay_ticks * scenario.period_s + lag_s
 
 
 def _characteristic(scenario: Scenario) -> Characteristic | None:

@@ -108,3 +108,27 @@ def test_a_gain_that_does_not_fit_is_named(change, message):
     with pytest.raises(CalibrationError) as error:
         params_of(TUNED | change)
     assert str(error.value) == message
+
+
+def test_gains_that_are_not_given_follow_from_the_reaction_of_the_train():
+    train = Vehicle(200e3, 0.01, 1.8, reaction_s=0.21)
+    theta = 0.225
+    tuned = pid_feedforward.tuned(pid_feedforward.Gains(ki=0.5), train)
+    assert (tuned.kp, tuned.kd) == pytest.approx((1 / (8 * theta**2), 1 / (2 * theta)))
+    assert (tuned.ki, tuned.mass_kg) == (0.5, 200e3)
+    prompt = Vehicle(200e3, 0.01, 1.8)  # ten periods count
+    assert pid_feedforward.tuned(pid_feedforward.Gains(), prompt).kp == pytest.approx(12.5)
+
+
+@pytest.mark.parametrize("reaction_s", [0.0, 0.05, 0.2, 0.6, 2.0, 10.0])
+def test_the_tuned_loop_has_the_margins_of_its_rule(reaction_s):
+    """Phase margin of the loop with all of the reaction as dead time."""
+    train = Vehicle(200e3, 0.01, 1.8, reaction_s=reaction_s)
+    tuned = pid_feedforward.tuned(pid_feedforward.Gains(), train)
+    w = np.geomspace(1e-3, 100.0, 200_000) / max(reaction_s, 0.1)
+    s = 1j * w
+    loop = (tuned.kp + tuned.ki / s + tuned.kd * s) / s**2 * np.exp(-s * (reaction_s + 0.015))
+    crossing = np.flatnonzero(np.abs(loop) > 1)[-1]
+    phase = np.degrees(np.unwrap(np.angle(loop))[crossing]) % 360 - 180
+    assert phase > 30
+    pid_feedforward.calibrate(pid_feedforward.Gains(), train)

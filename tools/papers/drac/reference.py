@@ -141,10 +141,10 @@ def _drac_exact_params(gains: drac_exact.Gains, vehicle: Vehicle) -> np.ndarray:
 
 
 def _pid_params(gains: pid_feedforward.Gains, vehicle: Vehicle) -> np.ndarray:
-    params = _track(gains, vehicle)
-    params["kp"], params["ki"], params["kd"] = gains.kp, gains.ki * vehicle.period_s, gains.kd
+    params, chosen = _track(gains, vehicle), pid_feedforward.tuned(gains, vehicle)
+    params["kp"], params["ki"], params["kd"] = chosen.kp, chosen.ki * vehicle.period_s, chosen.kd
     params["feed_forward"] = gains.feed_forward
-    params["mu"] = gains.mass_t * 1000 / vehicle.mass_kg
+    params["mu"] = chosen.mass_kg / vehicle.mass_kg
     return params
 
 
