@@ -74,15 +74,20 @@ def fmu_command(
     law: Annotated[
         str | None, typer.Option(help="Control law, or its .py file; the scenario's by default.")
     ] = None,
+    plant: Annotated[
+        bool, typer.Option("--plant", help="The plant instead: train, track, ATP and sensors.")
+    ] = False,
     bus: Annotated[
         FmuBus, typer.Option(help="none: signals of the frames are variables.")
     ] = FmuBus.none,
 ) -> None:
-    """The controller as an FMU, FMI 3.0 Co-Simulation, with its C and a binary for this machine."""
+    """The controller as an FMU (FMI 3.0 Co-Simulation) with its C and a binary, or the plant."""
     with one_line_for_bad_input():
         from ato_hil.plant_sim.scenario import load
         from ato_hil.tools.export.fmu import archive, controller
+        from ato_hil.tools.export.fmu import plant as plant_fmu
 
-        made = controller.unpacked(load(scenario), law)
+        part = plant_fmu if plant else controller
+        made = part.unpacked(load(scenario), law)
         missing = archive.write(made, out)
     say(f"{out}: {len(made.interface.variables)} variables; {missing or 'with a binary'}")

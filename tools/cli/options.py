@@ -18,6 +18,7 @@ class Mode(StrEnum):
     sil = "sil"
     mil = "mil"
     pil = "pil"
+    fmu = "fmu"
 
 
 class External(StrEnum):

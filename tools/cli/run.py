@@ -162,7 +162,7 @@ def run(
         Mode,
         typer.Option(
             help="hil: processes on a bus; sil: one compiled loop; mil: interpreted, checked;"
-            " pil: on an emulated microcontroller."
+            " pil: on an emulated microcontroller; fmu: with the FMUs that are named."
         ),
     ] = Mode.hil,
     bus: Annotated[
@@ -236,6 +236,14 @@ def run(
         ),
     ] = None,
     board: Annotated[BoardName, typer.Option(help="PIL: the microcontroller.")] = DEFAULT_BOARD,
+    controller_fmu: Annotated[
+        Path | None,
+        typer.Option(help="An FMU in the place of the controller: mode fmu, see docs/fmi.md."),
+    ] = None,
+    plant_fmu: Annotated[
+        Path | None,
+        typer.Option(help="An FMU in the place of the plant, likewise."),
+    ] = None,
     view: Annotated[
         Viewer | None,
         typer.Option(
@@ -254,6 +262,10 @@ def run(
             scenario = with_part(scenario, from_stop, to_stop)
         expected = [parse(text) for text in expect or ()]
         nodes = tuple(dict.fromkeys(node.value for node in external or ()))
+        if controller_fmu is not None or plant_fmu is not None:
+            if mode not in (Mode.hil, Mode.fmu):
+                raise fail(f"an FMU needs mode fmu, this is {mode.value}", EXIT_BAD_INPUT)
+            mode = Mode.fmu
         viewer = None
         if view is not None:
             if no_trace:
@@ -288,6 +300,8 @@ def run(
                 viewer=viewer,
                 firmware=firmware,
                 board=board.value,
+                controller_fmu=controller_fmu,
+                plant_fmu=plant_fmu,
             )
             # A trace that is thinned stays small.
             whole = not no_trace and (trace is Trace.full or viewer is not None)

@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ from ato_hil.tools.export.kinds import (
     Fields,
     Rows,
 )
-from ato_hil.tools.export.program import resolved, settled_constants
+from ato_hil.tools.export.program import Program, resolved, settled_constants
 from ato_hil.tools.export.records import Records
 from ato_hil.tools.export.translate import new_program
 from ato_hil.tools.runs import onboard
@@ -49,7 +50,15 @@ from ato_hil.tools.session import sil
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 PLANT_MODULES = ("actuator", "atp", "brakes", "failures", "plant", "radio", "track")
 PROFILE = 7  # place of the profile behind the ticks, in sil.build_loop
-LIMITS = ("times", "speeds", "targets", "knots")  # of atp.Limits
+TRAINS = trains.__path__
+# What ATP supervises: atp.Limits.
+LIMITS = Fields(
+    "ato_limits",
+    tuple(
+        (name, Rows(getattr(atp, kind), 1))
+        for name, kind in zip(atp.Limits._fields, ("LIMIT", "SPEED", "TARGET", "KNOT"), strict=True)
+    ),
+)
 REAL = """static double min_real(double a, double b) { return b < a ? b : a; }
 static double max_real(double a, double b) { return b > a ? b : a; }
 """
@@ -70,12 +79,7 @@ class Loop:
         state = controller_firmware.state_dtype(module.STATE)
         plant_params = plant.params_dtype(model.PARAMS)
         plant_state = plant.state_dtype(model.STATE)
-        modules = tick_sources.modules_of([law])
-        modules += [importlib.import_module(f"ato_hil.plant_sim.{name}") for name in PLANT_MODULES]
-        modules += [
-            importlib.import_module(f"ato_hil.plant_sim.trains.{found.name}")
-            for found in pkgutil.iter_modules(trains.__path__)
-        ]
+        modules = tick_sources.modules_of([law]) + plant_modules()
         modules += [
             importlib.import_module("ato_hil.tools.runs.frames"),
             importlib.import_module("ato_hil.tools.session.sil"),
@@ -92,20 +96,13 @@ class Loop:
         self.program = new_program(self.records.name)
         _, sense, act = plant.build(model)
         tick = controller_firmware.build_tick(module.step)
-        limits = Fields(
-            "ato_limits",
-            tuple(
-                (name, Rows(getattr(atp, kind), 1))
-                for name, kind in zip(LIMITS, ("LIMIT", "SPEED", "TARGET", "KNOT"), strict=True)
-            ),
-        )
         word = np.dtype(self.firmware.first.memory_dtype)
         self.loop = self.program.root(
             sil.build_loop(tick, sense, act),
             (
                 INT,
                 Rows(plant_params, 1),
-                limits,
+                LIMITS,
                 Rows(track.SECTION, 1),
                 Rows(plant_state, 1),
                 Rows(plant.CHANCE, 2),
@@ -120,7 +117,6 @@ class Loop:
                 Rows(np.dtype(np.int64), 1),
             ),
         )
-        self.limits = limits
         self.loop.name = "ato_loop"
 
     def text(self) -> str:
@@ -136,8 +132,7 @@ class Loop:
                 body += ["", *firmware.definition(program, function, function is self.loop)]
         heads = [f"static {program.head(f)};" for f in functions if f is not self.loop]
         heads.append(f"{program.head(self.loop)};")
-        arrays = [*self._tuple(), *self._several()]
-        arrays = [*self._counted(), *arrays]  # the tuple's arrays are known now
+        arrays = array_types(program)  # they name the last records
         cells, words = self.firmware.grid
         lines = [
             *firmware.top(self.firmware, "The whole closed loop: plant, frames and controllers."),
@@ -166,33 +161,46 @@ class Loop:
         ]
         return firmware.text_of(resolved(program, lines, names))
 
-    def _counted(self) -> Iterator[str]:
-        """Types of the arrays that know their lengths."""
-        for name, (dtype, dimensions) in self.program.counted.items():
-            yield "typedef struct {"
-            yield f"    {self.program.item(dtype)} *row;"
-            yield "    int64_t count;"
-            if dimensions > 1:
-                yield "    int64_t width; /* items a row */"
-            yield f"}} {name};"
-            yield ""
 
-    def _tuple(self) -> Iterator[str]:
-        """Type of what ATP supervises, a tuple of arrays."""
+def plant_modules() -> list[ModuleType]:
+    """The modules that the plant's steps and records are in."""
+    names = [*PLANT_MODULES, *(f"trains.{found.name}" for found in pkgutil.iter_modules(TRAINS))]
+    return [importlib.import_module(f"ato_hil.plant_sim.{name}") for name in names]
+
+
+def array_types(program: Program) -> list[str]:
+    """Types of what ATP supervises, a tuple of arrays, of the tuples that steps return, and before
+    them of the arrays that know their lengths."""
+    return [*_arrays(program, list(_tuple(program))), *_several(program)]
+
+
+def _arrays(program: Program, behind: list[str]) -> Iterator[str]:
+    for name, (dtype, dimensions) in program.counted.items():
         yield "typedef struct {"
-        for name, kind in self.limits.fields:
-            yield f"    {self.program.c_type(kind)}{name};"
-        yield f"}} {self.limits.name};"
+        yield f"    {program.item(dtype)} *row;"
+        yield "    int64_t count;"
+        if dimensions > 1:
+            yield "    int64_t width; /* items a row */"
+        yield f"}} {name};"
         yield ""
+    yield from behind
 
-    def _several(self) -> Iterator[str]:
-        """Types of the tuples that steps return."""
-        for name, several in self.program.several.items():
-            yield "typedef struct {"
-            for k, kind in enumerate(several.kinds):
-                yield f"    {self.program.c_type(kind)} item_{k};"
-            yield f"}} {name};"
-            yield ""
+
+def _tuple(program: Program) -> Iterator[str]:
+    yield "typedef struct {"
+    for name, kind in LIMITS.fields:
+        yield f"    {program.c_type(kind)}{name};"
+    yield f"}} {LIMITS.name};"
+    yield ""
+
+
+def _several(program: Program) -> Iterator[str]:
+    for name, several in program.several.items():
+        yield "typedef struct {"
+        for k, kind in enumerate(several.kinds):
+            yield f"    {program.c_type(kind)} item_{k};"
+        yield f"}} {name};"
+        yield ""
 
 
 class _Rows(ctypes.Structure):

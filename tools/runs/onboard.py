@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ato_hil.can_dbc.codec import MESSAGES
 from ato_hil.can_dbc.errors import expected, validation
 from ato_hil.controller.calibration import (
     Calibration,
@@ -173,6 +174,27 @@ def cars(loaded: Loaded) -> int:
     """How many cars get a force of their own."""
     scenario = loaded.scenario
     return len(scenario.train.effectiveness) if scenario.control.distribute else 0
+
+
+def frames(loaded: Loaded) -> tuple[list[str], list[str]]:
+    """Names of the frames that a scenario's controller receives, and that it sends."""
+    car_count, has_line = cars(loaded), loaded.scenario.line is not None
+    received: list[str] = []
+    sent: list[str] = []
+    for message in MESSAGES:
+        name = message.name
+        if name.startswith("CAR_FORCE_"):
+            if car_count > 2 * (int(name[-1]) - 1):
+                sent.append(name)
+        elif name.startswith("NEIGHBOUR_"):
+            received += [name] * has_line
+        elif name == "ATO_RADIO":
+            sent += [name] * has_line
+        elif name.startswith(("ATO_", "FORCE_CMD")):
+            sent.append(name)
+        else:
+            received.append(name)
+    return received, sent
 
 
 def run_numbers(law: str, runs: int, learned: int = -1) -> range:

@@ -15,9 +15,10 @@ import numpy as np
 from ato_hil.can_dbc import faults
 from ato_hil.controller import node, store
 from ato_hil.controller.node import Controller
+from ato_hil.plant_sim.fmi.process import FmuError
 from ato_hil.tools.runs.can_logs import Recording
 from ato_hil.tools.runs.result import Run
-from ato_hil.tools.session import boards, in_process, pil, processes
+from ato_hil.tools.session import boards, fmus, in_process, pil, processes
 from ato_hil.tools.session.interrupts import Interrupts
 from ato_hil.tools.session.options import Listener, Setup
 from ato_hil.tools.trace import facts
@@ -127,6 +128,43 @@ class OnTarget(InProcess):
             ):
                 self.about["target"] = pil.about(started, board)
                 yield run
+
+
+class Foreign(InProcess):
+    """The same with FMUs in the place of the controllers, of the plant, or of both."""
+
+    def _made(self) -> Generator[Run, None, None]:
+        setup, options = self.setup, self.setup.options
+        ours = [node.build(each, options.memory, options.firmware) for each in setup.calibrations]
+        self.about["controller"] = sizes(ours[0])
+        files = {"controller": options.controller_fmu, "plant": options.plant_fmu}
+        self.about["fmus"] = {part: file.name for part, file in files.items() if file is not None}
+        with ExitStack() as stack:
+            controllers: list[Any] = [fmus.OurController(each) for each in ours]
+            if options.controller_fmu is not None:
+                controllers = [
+                    fmus.controller(options.controller_fmu, setup.loaded, train, stack)
+                    for train in range(len(ours))
+                ]
+            watch = self.listener.progress
+            if options.plant_fmu is None:
+                made = pil.run_line(
+                    *(setup.loaded, setup.law, controllers),
+                    runs=setup.runs,
+                    seed=options.seed,
+                    progress=watch,
+                )
+            else:
+                there = fmus.world(options.plant_fmu, setup.loaded, setup.runs, options.seed, stack)
+                made = fmus.run_line(
+                    *(setup.loaded, setup.law, there, controllers[0]),
+                    runs=setup.runs,
+                    progress=watch,
+                )
+            try:
+                yield from made
+            except FmuError as error:  # what was good when it began
+                raise processes.RunError(str(error)) from None
 
 
 class Interpreted(InProcess):

@@ -26,7 +26,7 @@ from ato_hil.tools.trace.budget import thinning
 from ato_hil.tools.trace.live_viewer import LiveView
 
 RUNS_MAX = 4095  # Iteration has 12 bits
-MODES = ("hil", "sil", "mil", "pil")
+MODES = ("hil", "sil", "mil", "pil", "fmu")
 LOCKSTEP, REALTIME = "lockstep", "realtime"
 
 
@@ -66,7 +66,7 @@ class Options:
     scenario: str
     law: str | None
     runs: int | None
-    mode: str  # hil | sil | mil | pil
+    mode: str  # hil | sil | mil | pil | fmu
     bus: str
     seed: int
     out: Path
@@ -81,6 +81,8 @@ class Options:
     viewer: LiveView | None = None  # that looks on
     firmware: Path | None = None  # library in place of the controller's compiled steps; PIL: image
     board: str = boards.DEFAULT  # of PIL
+    controller_fmu: Path | None = None  # of mode fmu, in the place of the controller
+    plant_fmu: Path | None = None  # likewise of the plant
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class Setup:
     def words(self) -> tuple[str, ...]:
         """Names of the words of the learning memory, where it can be had: it is not on the bus."""
         in_processes = self.options.mode == "hil" and self.options.memory is None
-        if len(self.calibrations) != 1 or in_processes or self.options.mode == "pil":
+        if len(self.calibrations) != 1 or in_processes or self.options.mode in ("pil", "fmu"):
             return ()
         stored = int(self.calibrations[0].params[0]["memory"]["words"])
         return tuple(f"{name} [{unit}]" for name, unit, _q in load_law(self.law).WORDS[:stored])
@@ -186,6 +188,8 @@ def check(options: Options, held: ExitStack) -> Setup:
         _refuse_what_is_for_one_train(options)
     if options.pace == REALTIME:
         _refuse_without_clock(options)
+    if options.mode == "fmu":
+        _refuse_what_fmus_have_not(options, trains)
     weaker: list[str] = []
     if options.memory is not None:
         weaker = store.check_target(options.memory)
@@ -218,6 +222,17 @@ def _refuse_what_is_for_one_train(options: Options) -> None:
     ):
         if asked:
             raise SessionError(f"{options.scenario}: a line of several trains takes no {what}")
+
+
+def _refuse_what_fmus_have_not(options: Options, trains: list[Loaded]) -> None:
+    """Raises SessionError for what a session of FMUs cannot have."""
+    if options.controller_fmu is None and options.plant_fmu is None:
+        raise SessionError("mode fmu needs the FMU of a controller or of a plant")
+    if options.plant_fmu is not None and len(trains) > 1:
+        raise SessionError(f"{options.plant_fmu}: a line of several trains takes no plant FMU")
+    for what, asked in (("memory file", options.memory), ("library", options.firmware)):
+        if asked is not None and options.controller_fmu is not None:
+            raise SessionError(f"{options.controller_fmu}: a controller FMU takes no {what}")
 
 
 def _refuse_without_clock(options: Options) -> None:

@@ -316,8 +316,8 @@ def run_line(
         began = time.perf_counter()
         counts = _drive(here, started, number, chance, truth, frames, progress)
         seconds = time.perf_counter() - began
-        faults = [fault_names(target.state().faults) for target in started]
         _announce(here, started, plant.ENDED, number)
+        faults = [fault_names(target.state().faults) for target in started]
         if progress:
             progress(number, truth.shape[1])
         sent = [of_train[:count] for of_train, count in zip(frames, counts, strict=True)]

@@ -2,7 +2,7 @@
 
 Modes: `sil` (one compiled loop), `mil` (the same loop interpreted, in a child process where this
 one compiles), `hil` (three processes on a bus), `pil` (the firmware's image on an emulated
-microcontroller). All give the same digest. In HIL
+microcontroller), `fmu` (controller or plant, or both, are FMUs). All give the same digest. In HIL
 plant or controller, or both, may be external: started by their owner, known by their frames alone.
 Only HIL can also go by the clock, pace `realtime`: its digest depends on what was in time.
 """
@@ -28,7 +28,7 @@ from ato_hil.tools.runs.files import write_json, write_text
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
 from ato_hil.tools.runs.result import Run
 from ato_hil.tools.session.interrupts import Interrupts
-from ato_hil.tools.session.makers import InProcess, Interpreted, Maker, OnTarget
+from ato_hil.tools.session.makers import Foreign, InProcess, Interpreted, Maker, OnTarget
 from ato_hil.tools.session.options import (
     LOCKSTEP,
     RUNS_MAX,
@@ -179,6 +179,8 @@ class Session:
             return Interpreted(self.setup, self.listener, interrupts)
         if self.setup.options.mode == "pil":
             return OnTarget(self.setup, self.listener, interrupts)
+        if self.setup.options.mode == "fmu":
+            return Foreign(self.setup, self.listener, interrupts)
         return InProcess(self.setup, self.listener, interrupts)
 
     def _finish_run(self, run: Run, maker: Maker, recording: can_logs.Recording | None) -> None:

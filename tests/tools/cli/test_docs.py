@@ -44,7 +44,7 @@ def test_every_signal_and_every_option_is_there() -> None:
             assert (f"| {signal.name} |" in section) == (signal.name not in docs.PROTECTION)
     commands = docs.command_line()
     for text in (
-        "--mode {hil,sil,mil,pil} | ".replace(" | ", "` | `hil`"),
+        "--mode {hil,sil,mil,pil,fmu} | ".replace(" | ", "` | `hil`"),
         "`--sessions/--no-sessions`",
     ):
         assert text in commands

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 
-from ato_hil.can_dbc.codec import MESSAGES
 from ato_hil.controller import library
 from ato_hil.controller.process import CATCH_UP_MAX
 from ato_hil.controller.registry import law_label
@@ -43,29 +42,9 @@ def unpacked(loaded: Loaded, law: str | None) -> Unpacked:
             )
         )
         macros["FMU_TRAIN"] = "train"
-    received, sent = controller_frames(loaded)
+    received, sent = onboard.frames(loaded)
     variables.add_plain(interface, received, sent)
     return Unpacked(about, interface, _files(made, about, interface, macros))
-
-
-def controller_frames(loaded: Loaded) -> tuple[list[str], list[str]]:
-    """Names of the frames that a scenario's controller receives, and that it sends."""
-    cars, has_line = onboard.cars(loaded), loaded.scenario.line is not None
-    received, sent = [], []
-    for message in MESSAGES:
-        name = message.name
-        if name.startswith("CAR_FORCE_"):
-            if cars > 2 * (int(name[-1]) - 1):
-                sent.append(name)
-        elif name.startswith("NEIGHBOUR_"):
-            received += [name] * has_line
-        elif name == "ATO_RADIO":
-            sent += [name] * has_line
-        elif name.startswith(("ATO_", "FORCE_CMD")):
-            sent.append(name)
-        else:
-            received.append(name)
-    return received, sent
 
 
 def _files(
@@ -79,13 +58,7 @@ def _files(
         "ato.c": ato,
         "ato_can.h": firmware.can_file(made),
         "ato_config.c": firmware.config_file(translated),
-        "fmi3.h": sources.text("fmi3.h"),
-        "fmu.h": sources.text("fmu.h"),
-        "fmu.c": sources.text("fmu.c"),
-        "fmu_bus.c": sources.text("plain.c"),
-        "fmu_frames.h": sources.text("fmu_frames.h"),
-        "fmu_frames.c": sources.frames_file(interface),
         "fmu_model.h": sources.text("controller_model.h"),
         "fmu_model.c": model,
-        "fmu_variables.h": sources.variables_header(about, interface, macros),
+        **sources.shared(about, interface, macros),
     }

@@ -33,6 +33,19 @@ def text(name: str) -> str:
     return (HERE / name).read_text(encoding="utf-8")
 
 
+def shared(about: About, made: Interface, macros: dict[str, str]) -> dict[str, str]:
+    """What every FMU with frames has; `macros` for the references of some variables, by name."""
+    return {
+        "fmi3.h": text("fmi3.h"),
+        "fmu.h": text("fmu.h"),
+        "fmu.c": text("fmu.c"),
+        "fmu_bus.c": text("can.c" if made.has_bus else "plain.c"),
+        "fmu_frames.h": text("fmu_frames.h"),
+        "fmu_frames.c": frames_file(made),
+        "fmu_variables.h": variables_header(about, made, macros),
+    }
+
+
 def variables_header(about: About, made: Interface, names: dict[str, str]) -> str:
     """fmu_variables.h; `names` of macros for the references of some variables."""
     rows = []

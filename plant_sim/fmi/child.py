@@ -1,0 +1,416 @@
+"""The process of one FMU: loads it with FMPy, and answers requests on a socket.
+
+What the FMU does to this process, it does to no other. It keeps the inputs of a run, so that it can
+be asked whether the same inputs give the same outputs again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import socket
+import sys
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ato_hil.plant_sim.fmi import (
+    COUNT,
+    ERROR,
+    EVENT,
+    HEAD,
+    OPEN,
+    RESET,
+    STEP,
+    VERIFY,
+    Opened,
+    Port,
+    Wanted,
+)
+
+TRANSCEIVER = "org.fmi-ls-bus.transceiver"
+ITERATIONS_MAX = 50  # of one event
+REALS = ("Real", "Float64", "Float32")
+WHOLES = (
+    *("Integer", "Boolean", "Enumeration"),
+    *(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)),
+)
+# A unit of an FMU by its exponents of the SI's base units, and other names that tools give it.
+UNITS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {
+    "m": ({"m": 1}, ("metre", "meter")),
+    "m/s": ({"m": 1, "s": -1}, ("m.s-1", "m s-1", "m*s-1", "m/second")),
+    "m/s2": ({"m": 1, "s": -2}, ("m.s-2", "m/s^2", "m/s²", "m s-2", "m/(s.s)", "m/s/s")),
+    "N": ({"kg": 1, "m": 1, "s": -2}, ("newton", "kg.m/s2", "kg.m.s-2")),
+    "kg": ({"kg": 1}, ("kilogram",)),
+}
+
+
+class FmuError(Exception):
+    """The FMU is not what it has to be; one line."""
+
+
+class Group:
+    """Variables of one type, set or got by one call."""
+
+    def __init__(self, kind: str, references: Sequence[int], fmi: str) -> None:
+        import ctypes
+
+        count = len(references)
+        prefix = "fmi2" if fmi == "2.0" else "fmi3"
+        if fmi == "2.0":
+            call = "Integer" if kind == "Enumeration" else kind
+            item: Any = {"Real": ctypes.c_double}.get(kind, ctypes.c_int)
+        else:
+            call = "Int64" if kind == "Enumeration" else kind
+            sizes: dict[str, Any] = {"Float64": ctypes.c_double, "Float32": ctypes.c_float}
+            sizes["Boolean"] = ctypes.c_bool
+            item = sizes.get(call) or getattr(ctypes, f"c_{call.lower()}")
+        self.set_name, self.get_name = f"{prefix}Set{call}", f"{prefix}Get{call}"
+        self.references = (ctypes.c_uint * count)(*references)
+        self.values = (item * count)()
+        self.count = count
+        self.counts = (count,) if fmi == "2.0" else (count, count)
+
+    def set(self, slave: Any, values: Sequence[float]) -> None:
+        self.values[:] = values
+        getattr(slave, self.set_name)(
+            slave.component, self.references, self.count, self.values, *self.counts[1:]
+        )
+
+    def get(self, slave: Any) -> list[Any]:
+        getattr(slave, self.get_name)(
+            slave.component, self.references, self.count, self.values, *self.counts[1:]
+        )
+        return list(self.values)
+
+
+class Ports:
+    """The variables of one way, in the order in which their values come."""
+
+    def __init__(self, found: list[Any], fmi: str) -> None:
+        self.reals = [v for v in found if v.type in REALS]
+        self.wholes = [v for v in found if v.type in WHOLES]
+        self.groups: list[tuple[Group, list[int]]] = []
+        listed = [*self.reals, *self.wholes]
+        for kind in dict.fromkeys(v.type for v in listed):
+            places = [k for k, v in enumerate(listed) if v.type == kind]
+            references = [listed[k].valueReference for k in places]
+            self.groups.append((Group(kind, references, fmi), places))
+        self.names = [[v.name for v in self.reals], [v.name for v in self.wholes]]
+        self.struct = f"<{len(self.reals)}d{len(self.wholes)}q"
+
+    def set(self, slave: Any, values: Sequence[Any]) -> None:
+        for group, places in self.groups:
+            group.set(slave, [values[k] for k in places])
+
+    def get(self, slave: Any) -> list[Any]:
+        values: list[Any] = [0] * (len(self.reals) + len(self.wholes))
+        for group, places in self.groups:
+            for k, value in zip(places, group.get(slave), strict=True):
+                values[k] = value
+        return values
+
+
+class Fmu:
+    """One FMU, with one instance at a time. Raises FmuError for one that is not as wanted."""
+
+    def __init__(self, wanted: Wanted, folder: Path) -> None:
+        self.wanted = wanted
+        self.description = described(wanted.file)
+        self.fmi = "2.0" if self.description.fmiVersion == "2.0" else "3.0"
+        self.variables = {v.name: v for v in self.description.modelVariables}
+        refuse_other_platforms(wanted.file, self.fmi, self.description)
+        may_have_bus = wanted.bus_outputs is not None and self.fmi == "3.0"
+        self.bus = bus_of(wanted.file, self.variables) if may_have_bus else {}
+        inputs, outputs = wanted.inputs, wanted.outputs
+        if self.bus:
+            inputs, outputs = [], wanted.bus_outputs or []
+        self.inputs = Ports(self._ports(inputs, "input"), self.fmi)
+        self.outputs = Ports(self._ports(outputs, "output"), self.fmi)
+        for name in wanted.start:
+            if name not in self.variables:
+                raise FmuError(f"there is no parameter {name}")
+        from fmpy import extract
+
+        try:
+            self.folder = extract(wanted.file, unzipdir=str(folder))
+        except (OSError, zipfile.BadZipFile, ValueError) as error:
+            raise FmuError(f"cannot be unpacked: {error}") from None
+        self.slave: Any = None
+        self.time_s = 0.0
+        self.steps = 0
+        self.log: list[bytes] = []
+        self.seen = hashlib.blake2b()
+
+    def opened(self) -> Opened:
+        """What there is."""
+        version = self.description.version or ""
+        (real_in, whole_in), (real_out, whole_out) = self.inputs.names, self.outputs.names
+        return Opened(self.fmi, version, real_in, whole_in, real_out, whole_out, bool(self.bus))
+
+    def _ports(self, ports: Sequence[Port], causality: str) -> list[Any]:
+        found = []
+        for port in ports:
+            at = f"key {port.key}: " if port.key else ""
+            variable = self.variables.get(port.name)
+            if variable is None:
+                if port.needed:
+                    raise FmuError(f"{at}there is no variable {port.name}")
+                continue
+            if variable.type not in (*REALS, *WHOLES) or variable.dimensions:
+                raise FmuError(f"{at}{port.name} is no number")
+            allowed = ("output", "local") if causality == "output" else (causality,)
+            if variable.causality not in allowed:
+                raise FmuError(
+                    f"{at}{port.name} is of causality {variable.causality}, expected {causality}"
+                )
+            self._check_unit(at, port, variable)
+            found.append(variable)
+        return found
+
+    def _check_unit(self, at: str, port: Port, variable: Any) -> None:
+        declared = variable.declaredType
+        unit = variable.unit or (declared.unit if declared is not None else None)
+        if not port.unit or not unit:
+            return
+        exponents, names = UNITS[port.unit]
+        for known in self.description.unitDefinitions:
+            base = known.baseUnit
+            if known.name == unit and base is not None:
+                bases = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+                has = {b: getattr(base, b) for b in bases if getattr(base, b, 0)}
+                if has == exponents and (base.factor, base.offset) in ((1.0, 0.0), (None, None)):
+                    return
+                break
+        else:
+            if unit == port.unit or unit in names:
+                return
+        raise FmuError(f"{at}{port.name} is in {unit}, expected {port.unit}")
+
+    def start(self) -> None:
+        """A new instance at the start."""
+        from fmpy.fmi2 import FMU2Slave
+        from fmpy.fmi3 import FMU3Slave
+
+        arguments = {
+            "guid": self.description.guid,
+            "unzipDirectory": self.folder,
+            "modelIdentifier": self.description.coSimulation.modelIdentifier,
+            "instanceName": "ato_hil",
+        }
+        if self.slave is not None:
+            self.slave.terminate()
+            self.slave.freeInstance()
+        slave = FMU2Slave(**arguments) if self.fmi == "2.0" else FMU3Slave(**arguments)
+        self.slave = slave
+        if self.fmi == "2.0":
+            slave.instantiate()
+            slave.setupExperiment(startTime=0.0)
+            self._set_start()
+            slave.enterInitializationMode()
+            slave.exitInitializationMode()
+        else:
+            slave.instantiate(eventModeUsed=bool(self.bus))
+            self._set_start()
+            slave.enterInitializationMode()
+            slave.exitInitializationMode()
+        self.time_s, self.steps = 0.0, 0
+
+    def _set_start(self) -> None:
+        for name, value in self.wanted.start.items():
+            variable = self.variables[name]
+            if variable.type not in (*REALS, *WHOLES):
+                raise FmuError(f"parameter {name} is no number")
+            group = Group(variable.type, [variable.valueReference], self.fmi)
+            group.set(self.slave, [value if variable.type in REALS else int(value)])
+
+    def step(self, content: bytes) -> bytes:
+        """A step for each row of inputs; the outputs after the last."""
+        import struct
+
+        for row in struct.iter_unpack(self.inputs.struct, content):
+            self.inputs.set(self.slave, row)
+            self._do_step()
+        return struct.pack(self.outputs.struct, *self.outputs.get(self.slave))
+
+    def _do_step(self) -> bool:
+        """One step; whether an event has to be handled."""
+        self.steps += 1
+        end_s = self.steps * self.wanted.step_s
+        if self.fmi == "2.0":
+            self.slave.doStep(self.time_s, self.wanted.step_s)
+            self.time_s = end_s
+            return False
+        event, terminated, _early, _last = self.slave.doStep(self.time_s, self.wanted.step_s)
+        if terminated:
+            raise FmuError("asks to end the simulation")
+        self.time_s = end_s
+        return bool(event)
+
+    def turn(self, operations: bytes) -> bytes:
+        """An event in which operations come from the bus, then a step: what is sent at once, what
+        is sent after the step, and the outputs."""
+        import struct
+
+        at_once = self._event(operations) if operations or self.steps == 0 else b""
+        self.slave.enterStepMode()
+        later = b""
+        event = self._do_step()
+        self.slave.enterEventMode()
+        if event:
+            later = self._event(b"")
+        sent = b"".join(COUNT.pack(len(part)) + part for part in (at_once, later))
+        return sent + struct.pack(self.outputs.struct, *self.outputs.get(self.slave))
+
+    def _event(self, operations: bytes) -> bytes:
+        """What is sent in an event, which takes as many rounds as the FMU asks for."""
+        slave, bus = self.slave, self.bus
+        sent = b""
+        if operations:
+            slave.setClock([bus["Rx_Clock"]], [True])
+            slave.setBinary([bus["Rx_Data"]], [operations])
+        for _ in range(ITERATIONS_MAX):
+            if slave.getClock([bus["Tx_Clock"]])[0]:
+                sent += bytes(slave.getBinary([bus["Tx_Data"]])[0])
+            if not slave.updateDiscreteStates()[0]:
+                return sent
+        raise FmuError(f"an event does not end within {ITERATIONS_MAX} rounds")
+
+    def answer(self, kind: bytes, content: bytes) -> bytes:
+        """The answer to a request."""
+        if kind == RESET:
+            self.log, self.seen = [], hashlib.blake2b()
+            self.start()
+            return b""
+        if kind == VERIFY:
+            return b"1" if self._repeats() else b"0"
+        given = self._given(kind, content)
+        if self.wanted.keeps:
+            self.log.append(kind + content)
+            self.seen.update(given)
+        return given
+
+    def _given(self, kind: bytes, content: bytes) -> bytes:
+        if kind == STEP:
+            return self.step(content)
+        return self._event(content) if kind == EVENT else self.turn(content)
+
+    def _repeats(self) -> bool:
+        """Whether a new instance gives the same on all requests since the last reset."""
+        self.start()
+        again = hashlib.blake2b()
+        for request in self.log:
+            kind, content = request[:1], request[1:]
+            again.update(self._given(kind, content))
+        return again.digest() == self.seen.digest()
+
+
+def described(file: str) -> Any:
+    """The model description. Raises FmuError."""
+    try:
+        from fmpy import read_model_description
+    except ImportError:
+        raise FmuError("FMPy is not installed, try: pip install 'ato-hil[fmi]'") from None
+    try:
+        description = read_model_description(file, validate=False)
+    except FileNotFoundError:
+        raise FmuError("no such file") from None
+    except Exception as error:  # of a foreign file, whatever it is
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise FmuError(f"no FMU: {text}") from None
+    version = description.fmiVersion
+    if version != "2.0" and not version.startswith("3.0"):
+        raise FmuError(f"is of FMI {version}, expected 2.0 or 3.0")
+    if description.coSimulation is None:
+        raise FmuError("is not for Co-Simulation")
+    return description
+
+
+def refuse_other_platforms(file: str, fmi: str, description: Any) -> None:
+    """Raises FmuError if there is no binary for this machine."""
+    import fmpy
+
+    platform = fmpy.platform if fmi == "2.0" else fmpy.platform_tuple
+    with zipfile.ZipFile(file) as archive:
+        binaries = [n.split("/") for n in archive.namelist() if n.startswith("binaries/")]
+    has = sorted({parts[1] for parts in binaries if len(parts) > 2 and parts[-1]})
+    if platform not in has:
+        raise FmuError(f"has binaries for {', '.join(has) or 'no machine'}, expected {platform}")
+
+
+def bus_of(file: str, variables: dict[str, Any]) -> dict[str, int]:
+    """Value references of the members of its CAN terminal; empty if it has none."""
+    from xml.etree import ElementTree
+
+    with zipfile.ZipFile(file) as archive:
+        try:
+            root = ElementTree.fromstring(archive.read("terminalsAndIcons/terminalsAndIcons.xml"))
+        except KeyError:
+            return {}
+        except ElementTree.ParseError as error:
+            raise FmuError(f"terminalsAndIcons.xml: {error}") from None
+    buses = [t for t in root.iter("Terminal") if t.get("matchingRule") == TRANSCEIVER]
+    if len(buses) > 1:
+        raise FmuError(f"has {len(buses)} buses, expected one")
+    members: dict[str, Any] = {
+        member.get("memberName", ""): variables.get(member.get("variableName", ""))
+        for terminal in buses
+        for member in terminal.findall("TerminalMemberVariable")
+    }
+    if not buses:
+        return {}
+    names = ("Rx_Data", "Rx_Clock", "Tx_Data", "Tx_Clock")
+    for name in names:
+        if members.get(name) is None:
+            raise FmuError(f"its bus has no {name}")
+    if members["Tx_Clock"].causality != "output":
+        raise FmuError("Tx_Clock is not a triggered clock, as this importer needs it")
+    return {name: members[name].valueReference for name in names}
+
+
+def serve(line: socket.socket, folder: Path) -> None:
+    """Answers requests until the other side is gone."""
+    fmu: Fmu | None = None
+    while True:
+        head = line.recv(HEAD.size, socket.MSG_WAITALL)
+        if len(head) < HEAD.size:
+            return
+        kind, length = HEAD.unpack(head)
+        content = line.recv(length, socket.MSG_WAITALL) if length else b""
+        try:
+            if kind == OPEN:
+                fmu = Fmu(msgspec.json.decode(content, type=Wanted), folder)
+                fmu.start()
+                given = msgspec.json.encode(fmu.opened())
+            else:
+                assert fmu is not None
+                given = fmu.answer(kind, content)
+        except FmuError as error:
+            kind, given = ERROR, str(error).encode()
+        except Exception as error:  # of FMPy, or of the FMU through it
+            text = " ".join(str(error).split()).rstrip(".")
+            kind, given = ERROR, (text or type(error).__name__).encode()
+        line.sendall(HEAD.pack(kind, len(given)) + given)
+
+
+def main() -> int:
+    """Exit status 0 when the other side is gone."""
+    parser = argparse.ArgumentParser(
+        prog="python -m ato_hil.plant_sim.fmi.child", description=__doc__
+    )
+    parser.add_argument("descriptor", type=int, help="of the socket")
+    parser.add_argument("folder", type=Path, help="for what is unpacked")
+    arguments = parser.parse_args()
+    with socket.socket(fileno=arguments.descriptor) as line:
+        serve(line, arguments.folder)
+    # Without the destructors of the foreign library.
+    sys.stdout.flush()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

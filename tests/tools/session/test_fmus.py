@@ -1,0 +1,124 @@
+"""Sessions of FMUs: SIL's digest, and one line for each that is not as it has to be."""
+
+import shutil
+import zipfile
+
+import pytest
+
+from ato_hil.plant_sim.fmi.process import FmuError
+from ato_hil.plant_sim.scenario import ScenarioError, load
+from ato_hil.tools.export.fmu import archive, controller, plant
+from ato_hil.tools.session import session
+from ato_hil.tools.session.options import Options, SessionError
+from ato_hil.tools.session.processes import RunError
+
+pytest.importorskip("fmpy")
+if shutil.which("cc") is None:
+    pytest.skip("no C compiler is installed", allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory, short_text):
+    """The short scenario with noise and disturbance, and its FMUs."""
+    folder = tmp_path_factory.mktemp("fmus")
+    text = short_text + (
+        "\n[sensors]\nspeed_noise_m_s = 0.01\n"
+        "\n[disturbance]\namplitude_m_s2 = 0.01\nhold_ticks = 7\n"
+    )
+    (folder / "short.toml").write_text(text)
+    loaded = load(str(folder / "short.toml"))
+    archive.write(controller.unpacked(loaded, None), folder / "ato.fmu")
+    archive.write(plant.unpacked(loaded, None), folder / "train.fmu")
+    return folder
+
+
+@pytest.fixture
+def made(place, tmp_path, silent):
+    def run(mode="fmu", scenario=place / "short.toml", runs=2, **more):
+        options = Options(
+            *(str(scenario), None, runs, mode, "none", 3, tmp_path / mode, None),
+            trace=False,
+            **more,
+        )
+        return session.run(options, silent)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("parts", "runs"),
+    [
+        (("controller", "plant"), 1),
+        *(
+            pytest.param(parts, 2, marks=pytest.mark.long)
+            for parts in (("controller",), ("plant",), ("controller", "plant"))
+        ),
+    ],
+)
+def test_fmus_in_every_place_give_the_digest_of_sil(place, made, parts, runs):
+    expected = made("sil", runs=runs)
+    names = {"controller": "ato.fmu", "plant": "train.fmu"}
+    summary = made(runs=runs, **{f"{part}_fmu": place / names[part] for part in parts})
+    assert summary["digest"] == expected["digest"]
+    assert summary["fmus"] == {part: names[part] for part in parts}
+    for ours, theirs in zip(expected["runs"], summary["runs"], strict=True):
+        del ours["ticks_per_s"], theirs["ticks_per_s"]
+        assert ours == theirs
+
+
+@pytest.mark.long
+def test_a_line_has_an_fmu_for_each_train(tmp_path, made):
+    file = tmp_path / "line.toml"
+    file.write_text(
+        'base = "line-paper"\nruns = 1\n[metrics]\nfrom = 0\nto = 1\n'
+        "[line]\ntrains = 2\n[run_length]\nshortest_s = 2.0\nlongest_s = 2.0\n"
+    )
+    archive.write(controller.unpacked(load(str(file)), None), tmp_path / "ato.fmu")
+    summary = made(scenario=file, controller_fmu=tmp_path / "ato.fmu")
+    assert summary["digest"] == made("sil", scenario=file)["digest"]
+
+
+def test_another_scenario_is_refused(place, made):
+    with pytest.raises(FmuError, match=r"ato\.fmu: made for scenario \w+, expected \w+$"):
+        made(scenario="subway-fast", controller_fmu=place / "ato.fmu")
+
+
+def test_what_is_no_such_fmu_is_one_line(place, tmp_path, made):
+    with pytest.raises(FmuError, match=r"none\.fmu: no such file$"):
+        made(controller_fmu=tmp_path / "none.fmu")
+    (tmp_path / "text.fmu").write_text("text")
+    with pytest.raises(FmuError, match=r"text\.fmu: no FMU: "):
+        made(controller_fmu=tmp_path / "text.fmu")
+    with pytest.raises(FmuError, match=r"train\.fmu: RUN_CTRL\.fresh is of causality output"):
+        made(controller_fmu=place / "train.fmu")
+
+
+def test_a_binary_for_another_machine_is_one_line(place, tmp_path, made):
+    other = tmp_path / "other.fmu"
+    with zipfile.ZipFile(place / "ato.fmu") as old, zipfile.ZipFile(other, "w") as new:
+        for name in old.namelist():
+            new.writestr(name.replace("linux", "plan9"), old.read(name))
+    with pytest.raises(FmuError, match=r"other\.fmu: has binaries for \S+-plan9, expected \S+$"):
+        made(controller_fmu=other)
+
+
+def test_a_plant_that_ends_early_is_one_line(place, tmp_path, made):
+    with pytest.raises(SessionError, match="mode fmu needs the FMU of"):
+        made()
+    loaded = load(str(place / "short.toml"))
+    unpacked = plant.unpacked(loaded, None)
+    source = unpacked.sources["fmu_model.c"].replace(
+        "    case DRIVING:\n", "    case DRIVING:\n        for (;;) *(volatile int *)0 = 0;\n"
+    )
+    crashing = archive.Unpacked(
+        unpacked.about, unpacked.interface, unpacked.sources | {"fmu_model.c": source}
+    )
+    archive.write(crashing, tmp_path / "crash.fmu")
+    with pytest.raises(RunError, match=r"crash\.fmu: it crashed \(SIGSEGV\)$"):
+        made(plant_fmu=tmp_path / "crash.fmu")
+
+
+def test_a_plant_whose_runs_are_not_alike_is_refused():
+    for scenario, key in (("line-paper", "line"), ("crh3-learning", "run_length")):
+        with pytest.raises(ScenarioError, match=f"key {key}: "):
+            plant.unpacked(load(scenario), None)
