@@ -5,9 +5,10 @@ The folder is the first of these that can be written: `$NUMBA_CACHE_DIR/ato-hil`
 folder for temporary files if nobody else can enter it, else a temporary folder that ends with this
 process. All but the first three are said, once: child processes are told by `ATO_HIL_CACHE`.
 
-Each file holds what one step was compiled to for one signature, behind a header with a digest of
-the rest. A file that is empty, cut or changed is taken for none, and written anew. A cache that
-cannot be written, because its disk is full for example, costs time and nothing else.
+Each file holds what one step was compiled to for one signature, or a plan (`plant_sim/running`),
+behind a header with a digest of the rest. A file that is empty, cut or changed is taken for none,
+and written anew. A cache that cannot be written, because its disk is full for example, costs time
+and nothing else.
 """
 
 from __future__ import annotations

@@ -10,12 +10,16 @@ last bit.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from ato_hil.can_dbc import cache
+from ato_hil.can_dbc.step import cache_directory
 from ato_hil.plant_sim import atp, optimum
 from ato_hil.plant_sim.atp_tables import static_speeds
 from ato_hil.plant_sim.optimum import BOUNDS, Infeasible, Mesh
@@ -28,20 +32,25 @@ from ato_hil.plant_sim.planner import (
     units_of,
     whole_ticks,
 )
-from ato_hil.plant_sim.profile import POSITION_UNIT_M, Profile, evaluate
+from ato_hil.plant_sim.profile import POSITION_UNIT_M, SEGMENT, Profile, evaluate
 from ato_hil.plant_sim.track import Track, sections
 from ato_hil.plant_sim.trains import point
 from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 CELL_S = 0.15  # what a cell takes a fast train
-SPEED_SPARE_M_S = 0.01  # by which the table's speed may differ from that of the cells
 KNOT_M_S2 = 2e-4  # knots closer than this to a straight line are left out
-SPARE = 0.002  # of acceleration and jerk, for what is spread over the run
-ROUNDS = 12  # until the table's way is that of the plan, so far:
-NUDGE_M = 1e-4  # of the way; what is left is the work of single control periods,
-NUDGE_UNITS = 300  # with so many units of jerk (1.6 mm/s^3) at most, unless that is too few
+# Of acceleration and jerk, and m/s below the limits: what making the table may take. The first is
+# enough for most; where the table breaks a bound, it is planned again with the next.
+SPARES = ((0.002, 0.01), (0.006, 0.03), (0.02, 0.1))
+ROUNDS = 30  # until single control periods can do the rest of the way,
+NUDGE_UNITS = 200  # with so many units of jerk (1.1 mm/s^3) at most
 MADE_UP_UNITS = 100  # of jerk (0.6 mm/s^3), at most, for what the speed misses
+CATCH_UP_S = 10.0
 LONGEST_TICKS = 512  # of a segment: its jerk is rounded, and what that misses is made up for
+
+
+class Bound(PlanError):
+    """A table breaks a bound of its plan."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +71,50 @@ def road(track: Track, supervision: atp.Atp) -> Road:
 def plan_running(
     plan: ProfilePlan, period_s: float, train: point.Train, line: Road
 ) -> NDArray[np.void]:
-    """The `SEGMENT` table of a plan with an objective, shape (segments,).
+    """The `SEGMENT` table of a plan with an objective, shape (segments,); kept beside the compiled
+    steps, and found there again while plan, train, line and sources are the same.
 
     Raises PlanError if the plan cannot be met, ValueError for a period that the table cannot have.
     """
+    key = _key(plan, period_s, train, line)
+    folder = cache_directory("plant_sim")
+    name = f"plan.{hashlib.blake2b(key, digest_size=12).hexdigest()}{cache.SUFFIX}"
+    path = None if folder is None else folder / name
+    found = None if path is None else cache.load(path, key)
+    if isinstance(found, bytes):
+        return np.frombuffer(found, SEGMENT).copy()
+    segments = plan_anew(plan, period_s, train, line)
+    if path is not None:
+        cache.save(path, key, segments.tobytes())
+    return segments
+
+
+def _key(plan: ProfilePlan, period_s: float, train: point.Train, line: Road) -> bytes:
+    """All that a plan depends on but the sources."""
+    arrays = [array.tobytes() for array in (line.track, line.limit_from_m, line.limit_m_s)]
+    moved = (train.mass_kg, train.resistance, train.characteristic, train.braking)
+    return msgspec.msgpack.encode((plan, period_s, moved, arrays), order="deterministic")
+
+
+def plan_anew(
+    plan: ProfilePlan, period_s: float, train: point.Train, line: Road
+) -> NDArray[np.void]:
+    """As `plan_running`, not from the disk."""
+    for spare in SPARES[:-1]:
+        try:
+            return _planned(plan, period_s, train, line, spare)
+        except Bound:
+            pass
+    return _planned(plan, period_s, train, line, SPARES[-1])
+
+
+def _planned(
+    plan: ProfilePlan, period_s: float, train: point.Train, line: Road, spare: tuple[float, float]
+) -> NDArray[np.void]:
     assert plan.distance_m is not None
     units = units_of(period_s)
-    bounds = _bounds(plan, train)
-    mesh = _mesh(plan, bounds, line)
+    bounds = _bounds(plan, train, spare[0])
+    mesh = _mesh(plan, bounds, line, spare[1])
     try:
         if plan.objective == "time":
             squares = optimum.fastest(bounds, mesh)
@@ -111,7 +156,7 @@ def work_j(profile: Profile, train: point.Train, line: Road) -> tuple[float, flo
 # From plan, train and line to the bounds of the cells.
 
 
-def _bounds(plan: ProfilePlan, train: point.Train) -> np.void:
+def _bounds(plan: ProfilePlan, train: point.Train, spare: float) -> np.void:
     bounds = np.zeros(1, BOUNDS)[0]
     source = train.resistance
     bounds["constant"], bounds["linear"], bounds["square"] = (
@@ -122,19 +167,19 @@ def _bounds(plan: ProfilePlan, train: point.Train) -> np.void:
         bounds[name] = 1e3 if known is None else known.force_n * share
         power = np.inf if known is None or known.power_w is None else known.power_w * share
         bounds[f"{name}_power"] = power
-    bounds["acceleration"] = plan.max_acceleration_m_s2 * (1 - SPARE)
-    bounds["deceleration"] = (1 - SPARE) * (
+    bounds["acceleration"] = plan.max_acceleration_m_s2 * (1 - spare)
+    bounds["deceleration"] = (1 - spare) * (
         plan.max_deceleration_m_s2 or plan.max_acceleration_m_s2
     )
-    bounds["jerk"] = plan.max_jerk_m_s3 * (1 - SPARE)
+    bounds["jerk"] = plan.max_jerk_m_s3 * (1 - spare)
     bounds["recuperated"] = plan.recuperated_share
     return bounds
 
 
-def _mesh(plan: ProfilePlan, bounds: np.void, line: Road) -> Mesh:
+def _mesh(plan: ProfilePlan, bounds: np.void, line: Road, spare_m_s: float) -> Mesh:
     """Cells that a fast train takes CELL_S for, their ends on the places where a limit changes."""
     assert plan.distance_m is not None
-    nodes = _nodes(plan.distance_m, plan.max_speed_m_s, bounds)
+    nodes = _nodes(plan.distance_m, plan.max_speed_m_s, bounds, line)
     for place in line.limit_from_m:
         at = int(np.searchsorted(nodes, place))
         if 4 < at < len(nodes) - 4:
@@ -145,30 +190,48 @@ def _mesh(plan: ProfilePlan, bounds: np.void, line: Road) -> Mesh:
     first = np.searchsorted(line.limit_from_m, nodes[:-1] + 1e-9, side="right") - 1
     last = np.searchsorted(line.limit_from_m, nodes[1:] - 1e-9, side="right") - 1
     cell = np.array([line.limit_m_s[a : b + 1].min() for a, b in zip(first, last, strict=True)])
-    cell = np.minimum(cell - plan.margin_m_s, plan.max_speed_m_s) - SPEED_SPARE_M_S
+    cell = np.minimum(cell - plan.margin_m_s, plan.max_speed_m_s) - spare_m_s
     if cell.min() <= 0:
         raise PlanError(f"a limit at or below margin_m_s = {plan.margin_m_s:g} lets no train pass")
     node = np.concatenate([cell[:1], np.minimum(cell[1:], cell[:-1]), cell[-1:]])
     return Mesh(dx, np.diff(integral) / dx, node * node)
 
 
-def _nodes(length_m: float, speed_m_s: float, bounds: np.void) -> NDArray[np.float64]:
-    """Ends of cells, closer where a train is slow: from either end a start as fast as comfort
-    lets it be."""
+def _nodes(length_m: float, speed_m_s: float, bounds: np.void, line: Road) -> NDArray[np.float64]:
+    """Ends of cells, closer where a train is slow: from either end a start as fast as comfort and
+    limits let it be."""
+    begins = _half_nodes(length_m / 2, speed_m_s, bounds, line.limit_from_m, line.limit_m_s)
+    turned = np.concatenate([[-np.inf], length_m - line.limit_from_m[:0:-1]])
+    ends = _half_nodes(length_m / 2, speed_m_s, bounds, turned, line.limit_m_s[::-1])
+    return np.concatenate([begins, length_m - ends[-2::-1]])
+
+
+def _half_nodes(
+    until_m: float,
+    speed_m_s: float,
+    bounds: np.void,
+    from_m: NDArray[np.float64],
+    limits: NDArray[np.float64],
+) -> NDArray[np.float64]:
     parts = 20
     h = CELL_S / parts
-    a_max = max(bounds["acceleration"], bounds["deceleration"])
+    a_max = float(max(bounds["acceleration"], bounds["deceleration"]))
+    jerk = float(bounds["jerk"])
+    to_m = np.append(from_m[1:], np.inf)
     x = v = a = 0.0
-    half = [0.0]
-    while x < length_m / 2:
+    nodes = [0.0]
+    while x < until_m:
+        # Braking for a lower limit ahead, accelerating after one.
+        away = np.maximum(np.maximum(from_m - x, x - to_m), 0.0)
+        fastest = float(np.sqrt((limits * limits + 2 * a_max * away).min()))
+        fastest = min(fastest, speed_m_s)
         for _ in range(parts):
-            a = min(a + bounds["jerk"] * h, a_max)
-            v = min(v + a * h, speed_m_s)
+            a = min(a + jerk * h, a_max)
+            v = min(v + a * h, fastest)
             x += v * h
-        half.append(x)
-    # Both halves a little shorter, so that they meet in the middle.
-    nodes = np.array(half) * (length_m / 2 / half[-1])
-    return np.concatenate([nodes, length_m - nodes[-2::-1]])
+        nodes.append(x)
+    # A little shorter, so that both halves meet in the middle.
+    return np.array(nodes) * (until_m / x)
 
 
 def _knots(track: np.ndarray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -214,10 +277,12 @@ def _course(
     middles = np.concatenate([[0.0], ends - times / 2, ends[-1:]]) / (pace * period_s)
     inner = np.diff(squares) / (2 * mesh.dx_m) * pace * pace
     levels = np.concatenate([[0.0], inner, [0.0]])
-    # The straight lines leave the ends of cells their speeds; those of the middles they bend.
-    turn = np.diff(np.concatenate([-inner[:1], inner, -inner[-1:]]))
-    bent = (v[:-1] + v[1:]) / 2 * pace - (turn[:-1] + turn[1:]) * times / pace / 16
-    speeds = np.concatenate([[0.0], bent, [0.0]])
+    # Straight lines between the middles build up half of the first and the last acceleration only:
+    # what speed that is comes within seconds.
+    speeds = np.concatenate([[0.0], (v[:-1] + v[1:]) / 2 * pace, [0.0]])
+    soon = np.maximum(1 - middles * period_s / CATCH_UP_S, 0.0)
+    late = np.maximum(1 - (ticks - middles) * period_s / CATCH_UP_S, 0.0)
+    speeds[1:-1] -= speeds[1] / 2 * soon[1:-1] + speeds[-2] / 2 * late[1:-1]
     all_knots = np.unique(np.clip(np.rint(middles).astype(np.int64), 0, ticks))
     levels = np.interp(all_knots, middles, levels)
     kept = _simplified(all_knots, levels)
@@ -262,7 +327,7 @@ def _table(
         _settle(rows)
         segments = segments_of(rows)
         missing_m = distance_m - float(evaluate(segments, period_s).position_m[-1])
-        if abs(missing_m) < max(0.01, NUDGE_M * distance_m):
+        if abs(missing_m) < _most_nudged_m(len(rows)):
             _nudge(rows, missing_m)
             segments = segments_of(rows)
             _nudge(rows, distance_m - float(evaluate(segments, period_s).position_m[-1]))
@@ -271,7 +336,7 @@ def _table(
         more = 60 * missing_m / duration_s
         speeds = speeds + more / 2 * bump * bump
         levels = levels + more / duration_s * bump * (1 - 2 * part)
-    raise PlanError(f"the table ends {missing_m:.4f} m from distance_m = {distance_m:g}")
+    raise Bound(f"the table ends {missing_m:.4f} m from distance_m = {distance_m:g}")
 
 
 def _nudge(rows: NDArray[np.int64], missing_m: float) -> None:
@@ -283,6 +348,10 @@ def _nudge(rows: NDArray[np.int64], missing_m: float) -> None:
     units = round(missing_m / (d * unit_m))
     for at, sign in ((first, 1), (first + d, -1), (first + span, -1), (first + span + d, 1)):
         rows[at] += sign * units
+
+
+def _most_nudged_m(ticks: int) -> float:
+    return ticks // 8 * (6 * (ticks // 2) * POSITION_UNIT_M) * NUDGE_UNITS
 
 
 def _speed_at_end(rows: NDArray[np.int64]) -> int:
@@ -342,7 +411,7 @@ def _check(
 ) -> None:
     """What was promised of the finished table."""
     if abs(profile.position_m[-1] - (plan.distance_m or 0.0)) > DISTANCE_TOLERANCE_M:
-        raise PlanError(f"the table is {profile.position_m[-1]:.4f} m long")
+        raise Bound(f"the table is {profile.position_m[-1]:.4f} m long")
     most = plan.max_acceleration_m_s2, plan.max_deceleration_m_s2 or plan.max_acceleration_m_s2
     jerk = np.abs(segments["jerk"]).max() * jerk_m_s3
     a = profile.acceleration_m_s2
@@ -353,11 +422,11 @@ def _check(
         ("max_jerk_m_s3", jerk, plan.max_jerk_m_s3),
     ):
         if value > limit * (1 + LEVEL_TOLERANCE):
-            raise PlanError(f"the table needs {value:g}, above {name} = {limit:g}")
+            raise Bound(f"the table needs {value:g}, above {name} = {limit:g}")
     place = np.searchsorted(line.limit_from_m, profile.position_m, side="right") - 1
     over = profile.speed_m_s - line.limit_m_s[np.maximum(place, 0)]
     if over.max() > 0:
         at = int(np.argmax(over))
-        raise PlanError(
+        raise Bound(
             f"the table is {over[at]:.3f} m/s above the limit at {profile.position_m[at]:.1f} m"
         )

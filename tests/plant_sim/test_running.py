@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ato_hil.plant_sim import running
 from ato_hil.plant_sim.atp import Atp, StaticSpeed
 from ato_hil.plant_sim.planner import PlanError, ProfilePlan
 from ato_hil.plant_sim.profile import evaluate
-from ato_hil.plant_sim.running import plan_running, road, work_j
+from ato_hil.plant_sim.running import plan_anew, plan_running, road, work_j
 from ato_hil.plant_sim.track import Track
 from ato_hil.plant_sim.trains import point
 from tests import least_energy
@@ -39,7 +40,7 @@ def plan(**changes):
 
 
 def table(a_plan, a_train=None, line=LEVEL):
-    segments = plan_running(a_plan, PERIOD_S, a_train or train(), line)
+    segments = plan_anew(a_plan, PERIOD_S, a_train or train(), line)
     return segments, evaluate(segments, PERIOD_S)
 
 
@@ -155,6 +156,41 @@ def test_more_time_never_costs_more():
 
 def test_the_same_plan_gives_the_same_table():
     assert (table(plan())[0] == table(plan())[0]).all()
+
+
+def test_a_plan_is_kept_until_anything_that_it_depends_on_changes(tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "cache_directory", lambda package: tmp_path)
+    made = []
+
+    def anew(*args):
+        made.append(args)
+        return plan_anew(*args)
+
+    monkeypatch.setattr(running, "plan_anew", anew)
+    first = plan_running(plan(), PERIOD_S, train(), LEVEL)
+    again = plan_running(plan(), PERIOD_S, train(), LEVEL)
+    assert len(made) == 1
+    assert (again == first).all()
+    again["jerk"][0] += 1  # the caller's own
+    hill = road(Track(from_m=[0.0], resistance_n_per_kn=[1.0]), Atp())
+    for changed in (
+        (plan(max_jerk_m_s3=0.7), PERIOD_S, train(), LEVEL),
+        (plan(), 2 * PERIOD_S, train(), LEVEL),
+        (plan(), PERIOD_S, train(constant=0.01), LEVEL),
+        (plan(), PERIOD_S, train(), hill),
+    ):
+        before = len(made)
+        plan_running(*changed)
+        assert len(made) == before + 1
+    for path in tmp_path.iterdir():
+        path.write_bytes(path.read_bytes()[:-1])  # damaged: planned anew
+    assert (plan_running(plan(), PERIOD_S, train(), LEVEL) == first).all()
+    assert len(made) == 6
+
+
+def test_without_a_place_to_keep_plans_each_is_made(monkeypatch):
+    monkeypatch.setattr(running, "cache_directory", lambda package: None)
+    assert len(plan_running(plan(), PERIOD_S, train(), LEVEL)) > 10
 
 
 @pytest.mark.parametrize(

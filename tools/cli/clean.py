@@ -17,7 +17,7 @@ def clean(
         bool, typer.Option("--runs", help="The folders of sessions in runs/ here, too.")
     ] = False,
 ) -> None:
-    """Remove the compiled steps of this and of earlier versions; the next run compiles again."""
+    """Remove compiled steps and plans, of earlier versions too; the next run makes them again."""
     from ato_hil.can_dbc import cache
 
     with one_line_for_bad_input():

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from ato_hil.plant_sim.profile import evaluate
-from ato_hil.plant_sim.running import plan_running, road, work_j
+from ato_hil.plant_sim.running import plan_anew, road, work_j
 from ato_hil.plant_sim.scenario import Scenario
 from ato_hil.tools.lines import make, ttobench
 from tests import least_energy
@@ -43,13 +43,13 @@ def check_section(line, train, number, times):
     way = road(scenario.track, scenario.atp)
     moved, cells = least_energy.of_plan(plan, scenario.train, way, CELLS)
     built_up_s = max(plan.max_acceleration_m_s2, plan.max_deceleration_m_s2) / plan.max_jerk_m_s3
-    fastest_s = plan_running(plan, period_s, scenario.train, way)["ticks"].sum() * period_s
+    fastest_s = plan_anew(plan, period_s, scenario.train, way)["ticks"].sum() * period_s
     least_s = least_energy.least_time_s(moved, cells)
     assert 0.999 * least_s < fastest_s < 1.02 * least_s + built_up_s
     for given in times:
         duration_s = round(given if given > 10 else given * fastest_s, 2)
         wanted = msgspec.structs.replace(plan, objective="energy", duration_s=duration_s)
-        segments = plan_running(wanted, period_s, scenario.train, way)
+        segments = plan_anew(wanted, period_s, scenario.train, way)
         assert segments["ticks"].sum() * period_s == pytest.approx(duration_s)
         profile = evaluate(segments, period_s)
         work = work_j(profile, scenario.train, way)[0] / 3.6e6
