@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -16,6 +16,13 @@ UNKNOWN_FIELD = re.compile(r"Object contains unknown field `(.*)`")
 class InputError(ValueError):
     """Bad input: a scenario, law, DBC, bus name, file, environment. Its text is one line that names
     file, key and what was expected."""
+
+
+class Trouble(NamedTuple):
+    """What is wrong with a value, and where it stands."""
+
+    key: str  # dotted, "" for the whole
+    text: str
 
 
 def expected(name: str, known: Iterable[str]) -> str:
@@ -29,16 +36,15 @@ def expected(name: str, known: Iterable[str]) -> str:
     return f"expected one of {', '.join(names)}"
 
 
-def validation(error: msgspec.ValidationError, kind: Any) -> tuple[str, str]:
-    """(text, place) of what msgspec says of a value that should be a `kind`: the place as msgspec
-    writes it below the root (`.train.mass_kg`, `[2].node`, "" for the root), and of an unknown key
-    which ones there are."""
+def validation(error: msgspec.ValidationError, kind: Any, key: str = "") -> Trouble:
+    """What msgspec says of the value of `key` that should be a `kind`, and of an unknown key which
+    ones there are."""
     text, _, place = str(error).partition(" - at `$")
     place = place.rstrip("`")
     if unknown := UNKNOWN_FIELD.fullmatch(text):
         known = _fields(msgspec.inspect.type_info(kind), re.findall(r"\[[^]]*\]|\w[\w-]*", place))
         text = f"{text}, {expected(unknown[1], known)}" if known else text
-    return text, place
+    return Trouble(f"{key}{place}".lstrip("."), text)
 
 
 def _fields(kind: Any, path: list[str]) -> list[str]:

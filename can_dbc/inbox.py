@@ -13,7 +13,7 @@ import numpy as np
 
 from ato_hil.can_dbc import e2e
 from ato_hil.can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGE_COUNT, MESSAGES
-from ato_hil.can_dbc.faults import Receiver
+from ato_hil.can_dbc.fault_receiver import Receiver
 
 
 def fresh_frames(mailboxes: np.ndarray) -> list[tuple[int, int]]:

@@ -6,16 +6,11 @@ import math
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
+
+from ato_hil.can_dbc.errors import Trouble
 
 INT_MAX = 2**63 - 1
-
-
-class Trouble(NamedTuple):
-    """What is wrong, and where."""
-
-    key: str  # dotted, "" for the whole
-    text: str
 
 
 def read_toml(path: Path) -> dict[str, Any]:

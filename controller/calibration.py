@@ -161,8 +161,8 @@ def calibrate(
         recall = _recalled(known, typed, int(words["words"][0]))
         pitch_m = _pitch_m(known, typed)
     except msgspec.ValidationError as error:
-        text, where = validation(error, known.Gains)
-        raise CalibrationError(f"laws.{law_label(law)}{where}: {text}") from None
+        key, text = validation(error, known.Gains, f"laws.{law_label(law)}")
+        raise CalibrationError(f"{key}: {text}") from None
     except CalibrationError as error:
         raise CalibrationError(f"laws.{law_label(law)}: {error}") from None
     except Exception as error:  # whatever the law's own Python does

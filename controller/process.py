@@ -34,7 +34,8 @@ from ato_hil.can_dbc.bus import (
 )
 from ato_hil.can_dbc.child import Stop, follow_parent, tell
 from ato_hil.can_dbc.codec import RUN_CTRL, TRAIN_POSITION, get
-from ato_hil.can_dbc.faults import CONTROLLER, Receiver, receiver
+from ato_hil.can_dbc.fault_receiver import Receiver, receiver_of
+from ato_hil.can_dbc.faults import CONTROLLER
 from ato_hil.can_dbc.inbox import Inbox, fresh_frames, intact
 from ato_hil.can_dbc.step import refusal
 from ato_hil.controller import calibration, node, store
@@ -253,7 +254,7 @@ def main() -> int:
         intact(TRAIN_POSITION, 0)
         get(0, RUN_CTRL.RunState)  # likewise: while a run is armed there is no time for it
         controller.tx["fresh"].fill(0)
-        inbox = inbox_of(controller, receiver(arguments.faults, CONTROLLER, arguments.train))
+        inbox = inbox_of(controller, receiver_of(arguments.faults, CONTROLLER, arguments.train))
         bus = open_bus(arguments.bus)
     except (
         CalibrationError,

@@ -34,7 +34,8 @@ from ato_hil.can_dbc.bus import (
 )
 from ato_hil.can_dbc.child import Stop, follow_parent, tell
 from ato_hil.can_dbc.codec import ATO_STATUS, FORCE_CMD, get
-from ato_hil.can_dbc.faults import PLANT, receiver
+from ato_hil.can_dbc.fault_receiver import receiver_of
+from ato_hil.can_dbc.faults import PLANT
 from ato_hil.can_dbc.inbox import Inbox, fresh_frames, intact
 from ato_hil.plant_sim import failures, plant, world
 from ato_hil.plant_sim.scenario import ScenarioError, load
@@ -78,10 +79,10 @@ def port_of(
     faults: Path | None,
     fails: Sequence[failures.AnyFailure],
 ) -> Port:
-    """The port of a train; `faults` is the folder of `ato_hil.can_dbc.faults.receiver`."""
+    """The port of a train; `faults` is the folder of `fault_receiver.receiver_of`."""
     counters = here.state["node"]["received"][train]
     planned = failures.planned(fails, train, here.members[train].scenario.period_s)
-    return Port(bus, Inbox(here.rx[train], counters, receiver(faults, PLANT, train, planned)))
+    return Port(bus, Inbox(here.rx[train], counters, receiver_of(faults, PLANT, train, planned)))
 
 
 def collect(port: Port, timeout_s: float) -> list[tuple[int, int]]:

@@ -606,8 +606,8 @@ def in_run(loaded: Loaded, run: int) -> Loaded:
 
 def _wrong(error: msgspec.ValidationError) -> str:
     """The validator's message with the key first: `train.masses_kg: Expected ...`."""
-    text, place = validation(error, Scenario)
-    return f"key {place.lstrip('.')}: {text}" if place else text
+    key, text = validation(error, Scenario)
+    return f"key {key}: {text}" if key else text
 
 
 def _check(path: str, scenario: Scenario, under: str = "") -> None:

@@ -22,6 +22,7 @@ from ato_hil.can_dbc.codec import (
     TRAIN_POSITION,
     TRAIN_SPEED,
 )
+from ato_hil.can_dbc.fault_receiver import Receiver, receiver_of
 from ato_hil.can_dbc.faults import (
     CONTROLLER,
     PLANT,
@@ -30,7 +31,6 @@ from ato_hil.can_dbc.faults import (
     Frame,
     Plan,
     Planned,
-    Receiver,
 )
 
 SENSED = (ATP_LIMIT, TRAIN_SPEED, TRAIN_POSITION)  # what the plant sends in each tick
@@ -361,14 +361,14 @@ def test_another_process_reads_plan_and_log(tmp_path: Path) -> None:
     log: list[Event] = []
     for node in (PLANT, CONTROLLER):
         mine = Receiver(plan(MANY, tmp_path), node, 0, log.append)
-        theirs = faults.receiver(tmp_path, node, 0)
+        theirs = receiver_of(tmp_path, node, 0)
         assert theirs is not None
         for run in (1, 2):
             assert listen(theirs, 30, (CAR_FORCE_1,), run=run) == listen(
                 mine, 30, (CAR_FORCE_1,), run=run
             )
     assert faults.injected(tmp_path) == faults.in_order(log) != []
-    assert faults.receiver(None, PLANT, 0) is None
+    assert receiver_of(None, PLANT, 0) is None
 
 
 @pytest.mark.parametrize(

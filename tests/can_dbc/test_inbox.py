@@ -14,11 +14,11 @@ from ato_hil.can_dbc.codec import (
     TRAIN_SPEED,
     mailboxes,
 )
+from ato_hil.can_dbc.fault_receiver import Receiver
 from ato_hil.can_dbc.faults import (
     CONTROLLER,
     Drop,
     Plan,
-    Receiver,
 )
 from ato_hil.can_dbc.inbox import Inbox, intact
 

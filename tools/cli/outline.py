@@ -3,12 +3,12 @@ takes seconds, and so does the compiler that comes along."""
 
 from __future__ import annotations
 
-import tomllib
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import ato_hil.plant_sim
+from ato_hil.can_dbc.settings import read_toml
 
 FOLDER = Path(ato_hil.plant_sim.__file__).with_name("scenarios")
 
@@ -39,7 +39,7 @@ def _outline(name: str) -> Outline:
 def _content(name: str) -> dict[str, Any]:
     """The keys of `Outline` with what the base has of them, as plant_sim.scenario merges them."""
     file, _, case = name.partition(":")
-    own = tomllib.loads((FOLDER / f"{file}.toml").read_text(encoding="utf-8"))
+    own = read_toml(FOLDER / f"{file}.toml")
     content = {"title": "", "law": "", "laws": {}, "cases": {}}
     layers = [_content(own["base"])] if "base" in own else []
     layers += [own, *([own["cases"][case]] if case else [])]

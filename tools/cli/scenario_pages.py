@@ -240,8 +240,8 @@ def _with_defaults(path: Path, whole: dict[str, Any]) -> dict[str, Any]:
             try:
                 whole[parent][name] = msgspec.to_builtins(msgspec.convert(stated, record))
             except msgspec.ValidationError as error:
-                text, place = validation(error, record)
-                raise ScenarioError(f"{path}: {table}{place}: {text}") from None
+                key, text = validation(error, record, table)
+                raise ScenarioError(f"{path}: {key}: {text}") from None
     return whole
 
 

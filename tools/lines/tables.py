@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import csv
-import tomllib
 from pathlib import Path
 
 import msgspec
 
+from ato_hil.can_dbc import settings
 from ato_hil.tools.lines.records import Line, LineError, Train, check_steps, check_stops
 
 STOPS = ("position_m",)
@@ -42,11 +42,9 @@ def read_line(stops: Path, limits: Path, gradients: Path | None) -> Line:
 def read_train(path: Path) -> Train:
     """A train.toml: the keys of `records.Train`. Raises LineError with file and key."""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise LineError(f"{path}: cannot be read: {error.strerror}") from None
+        content = settings.read_toml(path)
     except ValueError as error:
-        raise LineError(f"{path}: not valid TOML: {error}") from None
+        raise LineError(f"{path}: {error}") from None
     try:
         return msgspec.convert({"name": path.stem, **content}, Train)
     except msgspec.ValidationError as error:

@@ -166,8 +166,8 @@ def _settings(key: str, values: dict[str, Any], kind: Any) -> Any:
     try:
         return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
-        text, place = validation(error, kind)
-        raise CalibrationError(f"{key}{place}: {text}") from None
+        where, text = validation(error, kind, key)
+        raise CalibrationError(f"{where}: {text}") from None
 
 
 def cars(loaded: Loaded) -> int:

@@ -15,13 +15,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from ato_hil.can_dbc.codec import FORCE_CMD
+from ato_hil.can_dbc.fault_receiver import Receiver
 from ato_hil.can_dbc.faults import (
     CONTROLLER,
     PLANT,
     Event,
     Frame,
     Plan,
-    Receiver,
     in_order,
 )
 from ato_hil.can_dbc.inbox import Inbox, fresh_frames

@@ -15,7 +15,7 @@ from ato_hil.plant_sim.scenario import Loaded
 from ato_hil.tools.runs import toml
 from ato_hil.tools.runs.files import write_text
 from ato_hil.tools.runs.result import Run
-from ato_hil.tools.session import session
+from ato_hil.tools.session import boards, session
 from ato_hil.tools.session.options import LOCKSTEP, Options, Silent
 
 Given = str | Path | Mapping[str, Any]
@@ -77,6 +77,8 @@ def simulate(
     trace: bool | None = None,
     memory: str | Path | None = None,
     pace: str = LOCKSTEP,
+    firmware: str | Path | None = None,
+    board: str = boards.DEFAULT,
     note: Callable[[str], object] | None = None,
 ) -> Simulation:
     """Runs of a scenario, as `ato-hil run` makes them.
@@ -87,13 +89,16 @@ def simulate(
     :param runs: how many; the scenario's by default.
     :param seed: of noise and disturbance.
     :param mode: sil: compiled, in this process; mil: interpreted, in a child; hil: processes on a
-        bus.
+        bus; pil: the image `firmware` on an emulated microcontroller.
     :param faults: to inject: the path of a .toml file, or a mapping in its form.
     :param bus: of mode hil, as for `ato-hil run`.
     :param out: folder of summary.json and trace.rrd; nothing is kept without one.
     :param trace: whether to write trace.rrd; by default if there is a folder.
     :param memory: file of the learning memory: read if it exists, written after each run.
     :param pace: lockstep or realtime (hil).
+    :param firmware: library of `ato-hil export c` in place of the compiled Python (sil, hil); the
+        image of `ato-hil export image` (pil).
+    :param board: of the image, a name of `ato-hil run --board`.
     :param note: is called with what a person should know, such as the bus that was chosen.
     :raises InputError: for bad input, one line that names file, key and what was expected.
     """
@@ -112,6 +117,8 @@ def simulate(
             trace=out is not None if trace is None else trace,
             faults=None if faults is None else Path(_file(faults, scratch / "faults.toml")),
             pace=pace,
+            firmware=None if firmware is None else Path(firmware),
+            board=board,
         )
         begun = session.begin(options, _Noted(note))
     except BaseException as error:

@@ -25,6 +25,7 @@ from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.frames import LineDigest
 from ato_hil.tools.session import boards, pil, sil
 from ato_hil.tools.session.processes import RunError
+from ato_hil.tools.session.simulate import simulate
 
 pytestmark = [
     pytest.mark.pil,
@@ -328,6 +329,12 @@ def test_the_command_writes_an_image_and_runs_it(
     assert summaries[0]["digest"] == summaries[1]["digest"]
     assert summaries[0]["target"]["board"] == "microbit"
     assert (tmp_path / "pil" / "trace.rrd").stat().st_size > 10_000
+
+
+def test_from_python_the_digest_is_that_of_sil(pid: Path) -> None:
+    on_target = simulate(SHORT, law="pid", runs=1, mode="pil", firmware=pid).complete()
+    assert on_target.digest == simulate(SHORT, law="pid", runs=1).complete().digest
+    assert on_target.summary["target"]["board"] == boards.DEFAULT
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])

@@ -178,6 +178,11 @@ def test_overflow_in_the_interpreter_is_one_line(tmp_path: Path) -> None:
         ato_hil.simulate(scenario, law=law, mode="mil", out=tmp_path / "out").complete()
 
 
+def test_pil_needs_an_image() -> None:
+    with pytest.raises(ato_hil.InputError, match=r"^mode pil needs an image of the firmware"):
+        ato_hil.simulate(SHORT, mode="pil")
+
+
 def test_the_import_is_cheap() -> None:
     code = (
         "import ato_hil, sys; ato_hil.InputError\n"
