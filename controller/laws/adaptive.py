@@ -31,14 +31,25 @@ import msgspec
 import numpy as np
 
 from ato_hil.can_dbc.step import Record, int64, step
-from ato_hil.controller.laws.cailc import errors
+from ato_hil.controller.laws.cailc import Q_ALPHA, Q_V, errors
 from ato_hil.controller.q import (
+    Q_ACCELERATION,
+    Q_ERROR,
+    Q_SPEED,
+    Q_UNIT,
     clamp,
     divide_round,
     round_shift,
     sat32,
 )
 from ato_hil.controller.quantise import Gain, Vehicle, fixed
+
+Q_LAM = 20  # of lam, q and eps1
+Q_G0 = 24  # g0/M, 1/s
+Q_G1 = 30  # g1 Ts
+Q_G2 = 40  # g2 Ts/M, m/s^2
+Q_H = 40  # h/M, m/s^2
+Q_COARSE = 28  # of h in products
 
 PARAMS = np.dtype(
     [
@@ -63,7 +74,7 @@ STATE = np.dtype(
 
 WORDS = ()
 # Estimates in the traces: name, unit, Q.
-ESTIMATES = (("h/M", "m/s^2", 27), ("delta", "m/s", 24), ("rho", "", 30))
+ESTIMATES = (("h/M", "m/s^2", Q_ACCELERATION), ("delta", "m/s", Q_ERROR), ("rho", "", Q_UNIT))
 
 H_MAX = (1 << 44) - 1
 Q_MAX = 1 << 32
@@ -86,12 +97,12 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
     """PARAMS, shape (1,), from SI gains. Raises CalibrationError where a gain does not fit."""
     mass, period = vehicle.mass_kg, vehicle.period_s
     params = np.zeros(1, PARAMS)
-    params["alpha"] = fixed("alpha", gains.alpha, 16)
-    params["g0"] = fixed("g0 / M", gains.g0 / mass, 24)
-    params["g1"] = fixed("g1 Ts", gains.g1 * period, 30, 31)
-    params["g2"] = fixed("g2 Ts / M", gains.g2 * period / mass, 40, 30)
-    params["eps1"] = fixed("eps1", gains.eps1, 20)
-    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, 27)
+    params["alpha"] = fixed("alpha", gains.alpha, Q_ALPHA)
+    params["g0"] = fixed("g0 / M", gains.g0 / mass, Q_G0)
+    params["g1"] = fixed("g1 Ts", gains.g1 * period, Q_G1, 31)
+    params["g2"] = fixed("g2 Ts / M", gains.g2 * period / mass, Q_G2, 30)
+    params["eps1"] = fixed("eps1", gains.eps1, Q_LAM)
+    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, Q_ACCELERATION)
     return params
 
 
@@ -102,26 +113,28 @@ def adaptive(params: Record, state: Record, cell: Record, inputs: Record, output
         state.h = 0
     errors(params, state, inputs)
     delta = int64(state.delta)
-    speed = clamp(abs(int64(inputs.speed)) >> 2, int64(0), int64(1) << 27)  # Q22, to 32 m/s
-    lam = (int64(1) << 20) + (speed >> 2) + ((speed * speed) >> 24)  # below 2^31
+    speed = abs(int64(inputs.speed)) >> (Q_SPEED - Q_V)
+    speed = clamp(speed, int64(0), int64(32) << Q_V)
+    lam = (int64(1) << Q_LAM) + (speed >> (Q_V - Q_LAM))  # at last below 2^31
+    lam += (speed * speed) >> (Q_V + Q_V - Q_LAM)
     # At 2^12 delta is 3.9 m/s or more, and the force at its limit; q rho stays below 2^62.
-    q = min(round_shift(lam * abs(delta), 24), int64(Q_MAX))
+    q = min(round_shift(lam * abs(delta), Q_ERROR), int64(Q_MAX))
     eps1 = int64(params.eps1)
-    rho = (int64(1) << 30) - divide_round(eps1 << 30, q + eps1)
+    rho = (int64(1) << Q_UNIT) - divide_round(eps1 << Q_UNIT, q + eps1)
 
     h = int64(state.h)
-    coarse = round_shift(h, 12)  # Q28, up to 2^32
-    lam_rho = round_shift(lam * rho, 30)  # Q20
-    bound = round_shift(coarse * lam_rho, 21)
+    coarse = round_shift(h, Q_H - Q_COARSE)  # up to 2^32
+    lam_rho = round_shift(lam * rho, Q_UNIT)
+    bound = round_shift(coarse * lam_rho, Q_COARSE + Q_LAM - Q_ACCELERATION)
     if delta < 0:
         bound = -bound
-    wanted = -round_shift(int64(params.g0) * delta, 21) - bound
-    decay = round_shift(coarse * int64(params.g1), 18)
-    growth = round_shift(round_shift(q * rho, 30) * int64(params.g2), 20)
+    wanted = -round_shift(int64(params.g0) * delta, Q_G0 + Q_ERROR - Q_ACCELERATION) - bound
+    decay = round_shift(coarse * int64(params.g1), Q_COARSE + Q_G1 - Q_H)
+    growth = round_shift(round_shift(q * rho, Q_UNIT) * int64(params.g2), Q_LAM + Q_G2 - Q_H)
     state.h = clamp(h - decay + growth, int64(0), int64(H_MAX))
 
     outputs.force = clamp(wanted, -int64(params.force_max), int64(params.force_max))
     outputs.status = 0
-    outputs.estimate[0] = sat32(h >> 13)
+    outputs.estimate[0] = sat32(h >> (Q_H - Q_ACCELERATION))
     outputs.estimate[1] = delta
     outputs.estimate[2] = rho

@@ -45,6 +45,8 @@ from ato_hil.can_dbc.step import (
 from ato_hil.controller.interface import FAULT_BARRIER
 from ato_hil.controller.laws.cailc import barrier
 from ato_hil.controller.q import (
+    Q_ERROR,
+    Q_POSITION,
     clamp,
     exp2_minus,
     round_shift,
@@ -255,7 +257,9 @@ def switching(phi: Int, inverse_eps: Int) -> Int:
 @step
 def afilc(params: Record, state: Record, cell: Record, inputs: Record, outputs: Record) -> None:
     """One tick of AFILC."""
-    e1 = sat32((int64(inputs.reference_position) - int64(inputs.position)) << 9)
+    e1 = sat32(
+        (int64(inputs.reference_position) - int64(inputs.position)) << (Q_ERROR - Q_POSITION)
+    )
     e2 = sat32(int64(inputs.reference_speed) - int64(inputs.speed))
     psi1 = int64(params.psi1)
     phi = sat32(round_shift(psi1 * e1, 24) + e2)

@@ -45,7 +45,7 @@ from ato_hil.controller.laws.afilc import (
     switching,
 )
 from ato_hil.controller.laws.cailc import barrier
-from ato_hil.controller.q import clamp, round_shift, sat32
+from ato_hil.controller.q import Q_ERROR, Q_POSITION, clamp, round_shift, sat32
 from ato_hil.controller.quantise import Vehicle, fixed
 
 PARAMS = np.dtype(
@@ -152,7 +152,9 @@ def afilc_track(
     params: Record, state: Record, cell: Record, inputs: Record, outputs: Record
 ) -> None:
     """One tick of AFILC along the track."""
-    e1 = sat32((int64(inputs.reference_position) - int64(inputs.position)) << 9)
+    e1 = sat32(
+        (int64(inputs.reference_position) - int64(inputs.position)) << (Q_ERROR - Q_POSITION)
+    )
     e2 = sat32(int64(inputs.reference_speed) - int64(inputs.speed))
     psi1 = int64(params.psi1)
     phi = sat32(round_shift(psi1 * e1, 24) + e2)

@@ -17,19 +17,14 @@ import numpy as np
 
 from ato_hil.can_dbc.step import Record, int64, step
 from ato_hil.controller.laws import cailc
-from ato_hil.controller.laws.cailc import errors, force, increments
-from ato_hil.controller.q import (
-    INT32_MAX,
-    INT32_MIN,
-    clamp,
-    sat32,
-)
+from ato_hil.controller.laws.cailc import errors, force, increments, speed_of
+from ato_hil.controller.q import INT32_MAX, INT32_MIN, Q_ACCELERATION, Q_ERROR, sat32
 from ato_hil.controller.quantise import Gain, Vehicle, fixed
 
 PARAMS = cailc.PARAMS
 STATE = cailc.STATE
 WORDS = cailc.WORDS
-ESTIMATES = (*WORDS, ("delta", "m/s", 24))
+ESTIMATES = (*WORDS, ("delta", "m/s", Q_ERROR))
 
 
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -44,12 +39,12 @@ class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
     """PARAMS, shape (1,), from SI gains; the fields of the barrier and the bounds stay 0."""
     params = np.zeros(1, PARAMS)
-    params["alpha"] = fixed("alpha", gains.alpha, 16)
-    params["beta"] = fixed("beta / M", gains.beta / vehicle.mass_kg, 24)
+    params["alpha"] = fixed("alpha", gains.alpha, cailc.Q_ALPHA)
+    params["beta"] = fixed("beta / M", gains.beta / vehicle.mass_kg, cailc.Q_BETA)
     for q in range(3):
         gamma = gains.Gamma[q] / vehicle.mass_kg
         params["gamma"][0, q] = fixed(f"Gamma[{q}] / M", gamma, cailc.GAMMA_Q[q], 27 if q else 32)
-    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, 27)
+    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, Q_ACCELERATION)
     return params
 
 
@@ -72,7 +67,7 @@ def ailc(params: Record, state: Record, cell: Record, inputs: Record, outputs: R
     """One tick of AILC."""
     ed = errors(params, state, inputs)
     delta = int64(state.delta)
-    speed = clamp(int64(inputs.speed) >> 2, -(int64(1) << 27), int64(1) << 27)  # Q22, +-32 m/s
+    speed = speed_of(inputs)
     increments(params, delta, speed, cell)
     theta_1 = sat32(int64(cell.before[0]) + int64(cell.learn[0]))
     theta_2 = sat32(int64(cell.before[1]) + int64(cell.learn[1]))

@@ -41,6 +41,11 @@ from ato_hil.can_dbc.step import (
 )
 from ato_hil.controller.interface import FAULT_BARRIER
 from ato_hil.controller.q import (
+    Q_ACCELERATION,
+    Q_ERROR,
+    Q_POSITION,
+    Q_SPEED,
+    Q_UNIT,
     clamp,
     round_shift,
     sat32,
@@ -53,8 +58,13 @@ from ato_hil.controller.quantise import (
     fixed,
 )
 
-THETA_Q = (34, 39, 43)
-GAMMA_Q = (30, 43, 49)
+Q_ALPHA = 16  # 1/s
+Q_BETA = 24  # beta/M, 1/s
+Q_INVERSE = 16  # 1/nu_b, s/m
+Q_V = 22  # m/s: +-32
+Q_V2 = 16  # m^2/s^2
+Q_THETA_1, Q_THETA_2, Q_THETA_3 = THETA_Q = (34, 39, 43)
+Q_GAMMA_1, Q_GAMMA_2, Q_GAMMA_3 = GAMMA_Q = (30, 43, 49)
 
 PARAMS = np.dtype(
     [
@@ -75,9 +85,9 @@ PARAMS = np.dtype(
 STATE = np.dtype([("delta", np.int32), ("chi", np.int32)], align=True)
 
 # Learned words: name, unit, Q.
-WORDS = (("Xi_1/M", "m/s^2", 34), ("Xi_2/M", "1/s", 39), ("Xi_3/M", "1/m", 43))
+WORDS = (("Xi_1/M", "m/s^2", Q_THETA_1), ("Xi_2/M", "1/s", Q_THETA_2), ("Xi_3/M", "1/m", Q_THETA_3))
 # Estimates in the traces: name, unit, Q.
-ESTIMATES = (*WORDS, ("delta", "m/s", 24), ("chi", "m/s", 24))
+ESTIMATES = (*WORDS, ("delta", "m/s", Q_ERROR), ("chi", "m/s", Q_ERROR))
 
 
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -102,18 +112,18 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
     format."""
     mass = vehicle.mass_kg
     params = np.zeros(1, PARAMS)
-    params["alpha"] = fixed("alpha", gains.alpha, 16)
-    params["beta"] = fixed("beta / M", gains.beta / mass, 24)
+    params["alpha"] = fixed("alpha", gains.alpha, Q_ALPHA)
+    params["beta"] = fixed("beta / M", gains.beta / mass, Q_BETA)
     for q in range(3):
         params["gamma"][0, q] = fixed(
             f"Gamma[{q}] / M", gains.Gamma[q] / mass, GAMMA_Q[q], 27 if q else 32
         )
         params["theta_min"][0, q] = fixed(f"Xi_min[{q}] / M", gains.Xi_min[q] / mass, THETA_Q[q])
         params["theta_max"][0, q] = fixed(f"Xi_max[{q}] / M", gains.Xi_max[q] / mass, THETA_Q[q])
-    params["nu_b"] = fixed("nu_b", gains.nu_b, 24)
-    params["inverse_nu_b"] = fixed("1 / nu_b", 1 / gains.nu_b, 16)
-    params["s_min"] = fixed("1 - r_max", 1 - gains.r_max, 30)
-    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, 27)
+    params["nu_b"] = fixed("nu_b", gains.nu_b, Q_ERROR)
+    params["inverse_nu_b"] = fixed("1 / nu_b", 1 / gains.nu_b, Q_INVERSE)
+    params["s_min"] = fixed("1 - r_max", 1 - gains.r_max, Q_UNIT)
+    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, Q_ACCELERATION)
     return params
 
 
@@ -142,38 +152,46 @@ def learned(gains: Gains, vehicle: Vehicle) -> tuple[list[int], list[int], list[
 def barrier(delta: Int, nu_b: Int, inverse_nu_b: Int, s_min: Int) -> Int:
     """chi = delta / cos^2(pi/2 r), Q24 saturated to +-128; cos(pi/2 r) = sin(pi/2 (1 - r)); one
     division."""
-    ratio = (clamp(delta, -nu_b, nu_b) * inverse_nu_b) >> 10  # delta / nu_b in [-1, 1], Q30
-    r = (ratio * ratio) >> 30
-    s = max((int64(1) << 30) - r, s_min)
+    inside = clamp(delta, -nu_b, nu_b)
+    ratio = (inside * inverse_nu_b) >> (Q_ERROR + Q_INVERSE - Q_UNIT)  # delta / nu_b in [-1, 1]
+    r = (ratio * ratio) >> Q_UNIT
+    s = max((int64(1) << Q_UNIT) - r, s_min)
     sine = sin_half_pi(s)
-    square = (sine * sine) >> 30
-    return sat32((delta << 30) // max(square, int64(1)))
+    square = (sine * sine) >> Q_UNIT
+    return sat32((delta << Q_UNIT) // max(square, int64(1)))
 
 
 @step
 def errors(params: Record, state: Record, inputs: Record) -> Int:
     """ed, Q24; writes state.delta = alpha e + ed, Q24, with e limited to +-16 m."""
-    e = clamp(
-        (int64(inputs.position) - int64(inputs.reference_position)) << 9,
-        -(int64(1) << 28),
-        int64(1) << 28,
-    )
+    away = int64(inputs.position) - int64(inputs.reference_position)
+    e = clamp(away << (Q_ERROR - Q_POSITION), -(int64(16) << Q_ERROR), int64(16) << Q_ERROR)
     ed = sat32(int64(inputs.speed) - int64(inputs.reference_speed))
-    state.delta = sat32(round_shift(int64(params.alpha) * e, 16) + ed)
+    state.delta = sat32(round_shift(int64(params.alpha) * e, Q_ALPHA) + ed)
     return ed
+
+
+@step
+def speed_of(inputs: Record) -> Int:
+    """v, Q22, limited to +-32 m/s."""
+    speed = int64(inputs.speed) >> (Q_SPEED - Q_V)
+    return clamp(speed, -(int64(32) << Q_V), int64(32) << Q_V)
 
 
 @step
 def increments(params: Record, chi: Int, speed: Int, cell: Record) -> None:
     """cell.learn = Gamma xi chi / M with xi = [-1, -v, -v^2]; chi Q24, v Q22."""
-    chi_v = round_shift(chi * speed, 22)
+    chi_v = round_shift(chi * speed, Q_V)
     chi_v = clamp(chi_v, 1 - (int64(1) << 36), (int64(1) << 36) - 1)  # times speed below 2^63
     # Beyond 2^37 (8192 m^3/s^3) every theta is at its bound anyway; the product with Gamma stays
     # below 2^63.
-    chi_v2 = clamp(round_shift(chi_v * speed, 22), -(int64(1) << 37), int64(1) << 37)
-    cell.learn[0] = sat32(-round_shift(chi * int64(params.gamma[0]), 20))
-    cell.learn[1] = sat32(-round_shift(chi_v * int64(params.gamma[1]), 28))
-    cell.learn[2] = sat32(-round_shift(chi_v2 * int64(params.gamma[2]), 30))
+    chi_v2 = clamp(round_shift(chi_v * speed, Q_V), -(int64(1) << 37), int64(1) << 37)
+    learn_1 = round_shift(chi * int64(params.gamma[0]), Q_ERROR + Q_GAMMA_1 - Q_THETA_1)
+    learn_2 = round_shift(chi_v * int64(params.gamma[1]), Q_ERROR + Q_GAMMA_2 - Q_THETA_2)
+    learn_3 = round_shift(chi_v2 * int64(params.gamma[2]), Q_ERROR + Q_GAMMA_3 - Q_THETA_3)
+    cell.learn[0] = sat32(-learn_1)
+    cell.learn[1] = sat32(-learn_2)
+    cell.learn[2] = sat32(-learn_3)
 
 
 @step
@@ -189,13 +207,14 @@ def force(
 ) -> Int:
     """(31) divided by M, Q27: learned resistance, acceleration, damping; limited to what the
     actuators give."""
-    v2 = (speed * speed) >> 28  # Q16
+    v2 = (speed * speed) >> (Q_V + Q_V - Q_V2)
     resistance = (
-        round_shift(theta_1, 7) + round_shift(theta_2 * speed, 34) + round_shift(theta_3 * v2, 32)
+        round_shift(theta_1, Q_THETA_1 - Q_ACCELERATION)
+        + round_shift(theta_2 * speed, Q_THETA_2 + Q_V - Q_ACCELERATION)
+        + round_shift(theta_3 * v2, Q_THETA_3 + Q_V2 - Q_ACCELERATION)
     )
-    damping = round_shift(int64(params.alpha) * ed, 13) + round_shift(
-        int64(params.beta) * delta, 21
-    )
+    damping = round_shift(int64(params.alpha) * ed, Q_ALPHA + Q_ERROR - Q_ACCELERATION)
+    damping += round_shift(int64(params.beta) * delta, Q_BETA + Q_ERROR - Q_ACCELERATION)
     wanted = resistance + int64(inputs.ahead_acceleration) - damping
     return clamp(wanted, -int64(params.force_max), int64(params.force_max))
 
@@ -205,7 +224,7 @@ def cailc(params: Record, state: Record, cell: Record, inputs: Record, outputs: 
     """One tick of CAILC."""
     ed = errors(params, state, inputs)
     delta = int64(state.delta)
-    speed = clamp(int64(inputs.speed) >> 2, -(int64(1) << 27), int64(1) << 27)  # Q22, +-32 m/s
+    speed = speed_of(inputs)
     chi = barrier(delta, int64(params.nu_b), int64(params.inverse_nu_b), int64(params.s_min))
     state.chi = chi
     increments(params, chi, speed, cell)

@@ -62,6 +62,8 @@ from ato_hil.can_dbc.step import (
 from ato_hil.controller import characteristic
 from ato_hil.controller.q import (
     INT32_MAX,
+    Q_ERROR,
+    Q_POSITION,
     clamp,
     round_shift,
     sat32,
@@ -275,7 +277,7 @@ def errors(params: Record, track: Record, inputs: Record) -> None:
     e2 = sat32(int64(inputs.speed) - int64(inputs.reference_speed))
     old = int64(track.e2)
     track.e2 = sat32(old + round_shift((e2 - old) * int64(params.filter), 30))
-    away = (int64(inputs.position) - int64(inputs.reference_position)) << 9
+    away = (int64(inputs.position) - int64(inputs.reference_position)) << (Q_ERROR - Q_POSITION)
     z1 = clamp(away, -int64(params.z1_max), int64(params.z1_max))
     track.z1 = z1
     track.clamped = 1 if z1 != away else 0

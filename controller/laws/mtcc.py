@@ -58,11 +58,27 @@ from ato_hil.controller import separation
 from ato_hil.controller.interface import FAULT_BARRIER, SIDES
 from ato_hil.controller.q import (
     INT32_MAX,
+    Q_ACCELERATION,
+    Q_ERROR,
+    Q_POSITION,
+    Q_SPEED,
+    Q_UNIT,
     clamp,
     round_shift,
     sat32,
 )
 from ato_hil.controller.quantise import CalibrationError, Vehicle, fixed
+
+Q_GAIN = 24  # beta, h, c, 1/s; alpha/k, m/s^2
+Q_INVERSE = 16  # 1/k, 1/m
+Q_SLOPE = 12  # of B, 1/s^2
+Q_V = 22  # m/s: +-32
+Q_V2 = 16  # m^2/s^2
+Q_SV2 = 18  # s v^2, m^3/s^3
+Q_F, Q_A1, Q_A2 = 56, 62, 62  # the estimates; m/s^2, 1/s, 1/m
+Q_F_TOP, Q_A1_TOP, Q_A2_TOP = 28, 34, 40  # their upper 32 bits
+Q_RATES = Q_RATE_F, Q_RATE_A1, Q_RATE_A2 = (36, 42, 44)  # Ts lambda
+Q_LEAK = 32  # Ts sigma
 
 E_MAX = 1 << 30  # m, Q24: 64
 S_E_MAX = 1 << 25  # m, Q24: 2, in the adaptation
@@ -133,12 +149,17 @@ STATE_BOUNDS = {"f": (-F_MAX, F_MAX), "a1": (-A1_MAX, A1_MAX), "a2": (-A2_MAX, A
 WORDS = ()
 # Estimates in the traces: name, unit, Q.
 COMMON_ESTIMATES = (
-    ("B", "m/s^2", 27),
-    ("u2", "m/s^2", 27),
-    ("u3", "m/s^2", 27),
+    ("B", "m/s^2", Q_ACCELERATION),
+    ("u2", "m/s^2", Q_ACCELERATION),
+    ("u3", "m/s^2", Q_ACCELERATION),
     ("frozen", "ticks", 0),
 )
-ESTIMATES = (*COMMON_ESTIMATES, ("f", "m/s^2", 28), ("a1", "1/s", 34), ("a2", "1/m", 40))
+ESTIMATES = (
+    *COMMON_ESTIMATES,
+    ("f", "m/s^2", Q_F_TOP),
+    ("a1", "1/s", Q_A1_TOP),
+    ("a2", "1/m", Q_A2_TOP),
+)
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -174,12 +195,12 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
     """PARAMS, shape (1,). Raises CalibrationError where a gain does not fit its format."""
     params = np.zeros(1, PARAMS)
     params["common"] = calibrate_common(gains, vehicle)
-    params["c"] = fixed("c", gains.c, 24)
-    params["f_initial"] = fixed("f_initial", gains.f_initial, 28, 31)
-    for i, q in enumerate((36, 42, 44)):
+    params["c"] = fixed("c", gains.c, Q_GAIN)
+    params["f_initial"] = fixed("f_initial", gains.f_initial, Q_F_TOP, 31)
+    for i, q in enumerate(Q_RATES):
         rate = vehicle.period_s * gains.lam[i]
         params["rate"][0, i] = fixed(f"Ts lam[{i}]", rate, q)
-        params["leak"][0, i] = fixed(f"Ts sigma[{i}]", vehicle.period_s * gains.sigma[i], 32)
+        params["leak"][0, i] = fixed(f"Ts sigma[{i}]", vehicle.period_s * gains.sigma[i], Q_LEAK)
     return params
 
 
@@ -190,14 +211,14 @@ def calibrate_common(gains: CommonGains, vehicle: Vehicle) -> np.ndarray:
     params["separation"] = separation.calibrate(
         l1_m=gains.l1_m, l2_m=gains.l2_m, d=gains.d, most_m_s2=gains.cooperation_max_m_s2
     )
-    params["beta"] = fixed("beta", gains.beta, 24)
-    params["h"] = fixed("h", gains.h, 24)
-    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, 27)
+    params["beta"] = fixed("beta", gains.beta, Q_GAIN)
+    params["h"] = fixed("h", gains.h, Q_GAIN)
+    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, Q_ACCELERATION)
     params["slope_max"] = INT32_MAX
     if gains.slope_max_m_s3 is not None:
         slope = gains.slope_max_m_s3 * vehicle.period_s
-        params["slope_max"] = fixed("Ts slope_max_m_s3", slope, 27)
-    params["freeze_above"] = fixed("freeze_above_m_s2", gains.freeze_above_m_s2, 27)
+        params["slope_max"] = fixed("Ts slope_max_m_s3", slope, Q_ACCELERATION)
+    params["freeze_above"] = fixed("freeze_above_m_s2", gains.freeze_above_m_s2, Q_ACCELERATION)
     return params
 
 
@@ -209,12 +230,14 @@ def calibrate_barrier(gains: CommonGains) -> np.ndarray:
     most = gains.barrier_max_m_s2
     if edge >= 64:
         raise CalibrationError(f"k: {k:g} is outside what the firmware holds, 64")
-    params["k"] = fixed("k", k, 24)
-    params["inverse_k"] = fixed("1 / k", 1 / k, 16)
-    params["scale"] = fixed("alpha / k", gains.alpha / k, 24)
-    params["edge"] = fixed("eta k", edge, 24)
-    params["slope"] = fixed("slope of the barrier at eta k", slope, 12)
-    params["most"] = INT32_MAX if most is None else fixed("barrier_max_m_s2", most, 27)
+    params["k"] = fixed("k", k, Q_ERROR)
+    params["inverse_k"] = fixed("1 / k", 1 / k, Q_INVERSE)
+    params["scale"] = fixed("alpha / k", gains.alpha / k, Q_GAIN)
+    params["edge"] = fixed("eta k", edge, Q_ERROR)
+    params["slope"] = fixed("slope of the barrier at eta k", slope, Q_SLOPE)
+    params["most"] = INT32_MAX
+    if most is not None:
+        params["most"] = fixed("barrier_max_m_s2", most, Q_ACCELERATION)
     return params
 
 
@@ -222,7 +245,7 @@ def calibrate_barrier(gains: CommonGains) -> np.ndarray:
 def position_error(inputs: Record) -> Int:
     """e, m, Q24, limited to +-64."""
     away = int64(inputs.position) - int64(inputs.reference_position)
-    return clamp(away << 9, -int64(E_MAX), int64(E_MAX))
+    return clamp(away << (Q_ERROR - Q_POSITION), -int64(E_MAX), int64(E_MAX))
 
 
 @step
@@ -235,11 +258,11 @@ def speed_error(inputs: Record) -> Int:
 def barrier(params: Record, e: Int) -> Int:
     """B(e), m/s^2, Q27; one division."""
     inside = clamp(e, -int64(params.edge), int64(params.edge))
-    z = (inside * int64(params.inverse_k)) >> 10  # e / k, Q30
-    rest = (int64(1) << 30) - ((z * z) >> 30)
-    ratio = sat32((z << 24) // max(rest, int64(1)))  # z / (1 - z^2), Q24
-    beyond = round_shift((e - inside) * int64(params.slope), 9)
-    wanted = round_shift(ratio * int64(params.scale), 21) + beyond
+    z = (inside * int64(params.inverse_k)) >> (Q_ERROR + Q_INVERSE - Q_UNIT)  # e / k
+    rest = (int64(1) << Q_UNIT) - ((z * z) >> Q_UNIT)
+    ratio = sat32((z << Q_ERROR) // max(rest, int64(1)))  # z / (1 - z^2)
+    wanted = round_shift(ratio * int64(params.scale), Q_ERROR + Q_GAIN - Q_ACCELERATION)
+    wanted += round_shift((e - inside) * int64(params.slope), Q_ERROR + Q_SLOPE - Q_ACCELERATION)
     return clamp(wanted, -int64(params.most), int64(params.most))
 
 
@@ -250,7 +273,7 @@ def consensus(params: Record, inputs: Record) -> Int:
     for side in range(SIDES):
         if int64(inputs.neighbour[side]) != 0:
             total += int64(inputs.closing[side])
-    return sat32(round_shift(sat32(total) * int64(params.h), 21))
+    return sat32(round_shift(sat32(total) * int64(params.h), Q_ERROR + Q_GAIN - Q_ACCELERATION))
 
 
 @step
@@ -292,35 +315,40 @@ def limited(params: Record, state: Record, inputs: Record, wanted: Int) -> Int:
 @step
 def speed_of(inputs: Record) -> Int:
     """v, m/s, Q22, limited to +-32."""
-    return clamp(int64(inputs.speed) >> 2, -int64(V_MAX), int64(V_MAX))
+    return clamp(int64(inputs.speed) >> (Q_SPEED - Q_V), -int64(V_MAX), int64(V_MAX))
 
 
 @step
 def resistance(state: Record, v: Int) -> Int:
     """fh + a1h v + a2h v^2, m/s^2, Q27."""
-    v2 = (v * v) >> 28  # Q16, at most 2^26
+    v2 = (v * v) >> (Q_V + Q_V - Q_V2)  # at most 2^26
+    a1 = int64(state.a1) >> (Q_A1 - Q_A1_TOP)
+    a2 = int64(state.a2) >> (Q_A2 - Q_A2_TOP)
     return (
-        round_shift(int64(state.f), 29)
-        + round_shift((int64(state.a1) >> 28) * v, 29)
-        + round_shift((int64(state.a2) >> 22) * v2, 29)
+        round_shift(int64(state.f), Q_F - Q_ACCELERATION)
+        + round_shift(a1 * v, Q_A1_TOP + Q_V - Q_ACCELERATION)
+        + round_shift(a2 * v2, Q_A2_TOP + Q_V2 - Q_ACCELERATION)
     )
 
 
 @step
 def adapt(params: Record, state: Record, s: Int, v: Int) -> None:
     """The estimates a tick on; s Q24 in +-4, v Q22 in +-32."""
-    s_v = round_shift(s * v, 22)  # Q24, at most 2^31
-    s_v2 = round_shift(s_v * v, 28)  # Q18, at most 2^30
+    s_v = round_shift(s * v, Q_V)  # at most 2^31
+    s_v2 = round_shift(s_v * v, Q_ERROR + Q_V - Q_SV2)  # at most 2^30
     f = int64(state.f)
     a1 = int64(state.a1)
     a2 = int64(state.a2)
-    # The leak works on the estimate's upper 32 bits: Q28, Q34, Q40, times Q32.
-    f -= round_shift(s * int64(params.rate[0]), 4)
-    f -= round_shift((int64(state.f) >> 28) * int64(params.leak[0]), 4)
-    a1 -= round_shift(s_v * int64(params.rate[1]), 4)
-    a1 -= round_shift((int64(state.a1) >> 28) * int64(params.leak[1]), 4)
-    a2 -= s_v2 * int64(params.rate[2])
-    a2 -= round_shift((int64(state.a2) >> 22) * int64(params.leak[2]), 10)
+    # The leak works on the estimate's upper 32 bits.
+    f_top = f >> (Q_F - Q_F_TOP)
+    a1_top = a1 >> (Q_A1 - Q_A1_TOP)
+    a2_top = a2 >> (Q_A2 - Q_A2_TOP)
+    f -= round_shift(s * int64(params.rate[0]), Q_ERROR + Q_RATE_F - Q_F)
+    f -= round_shift(f_top * int64(params.leak[0]), Q_F_TOP + Q_LEAK - Q_F)
+    a1 -= round_shift(s_v * int64(params.rate[1]), Q_ERROR + Q_RATE_A1 - Q_A1)
+    a1 -= round_shift(a1_top * int64(params.leak[1]), Q_A1_TOP + Q_LEAK - Q_A1)
+    a2 -= s_v2 * int64(params.rate[2])  # Q_SV2 + Q_RATE_A2 is Q_A2
+    a2 -= round_shift(a2_top * int64(params.leak[2]), Q_A2_TOP + Q_LEAK - Q_A2)
     state.f = clamp(f, -int64(F_MAX), int64(F_MAX))
     state.a1 = clamp(a1, -int64(A1_MAX), int64(A1_MAX))
     state.a2 = clamp(a2, -int64(A2_MAX), int64(A2_MAX))
@@ -331,7 +359,7 @@ def adapting_error(params: Record, e: Int, ev: Int) -> Int:
     """s, m/s, Q24, of errors limited to 2 m and 2 m/s."""
     near = clamp(e, -int64(S_E_MAX), int64(S_E_MAX))
     slow = clamp(ev, -int64(S_EV_MAX), int64(S_EV_MAX))
-    return clamp(slow + round_shift(near * int64(params.c), 24), -int64(S_MAX), int64(S_MAX))
+    return clamp(slow + round_shift(near * int64(params.c), Q_GAIN), -int64(S_MAX), int64(S_MAX))
 
 
 @step
@@ -340,18 +368,18 @@ def mtcc(params: Record, state: Record, cell: Record, inputs: Record, outputs: R
     common = params.common
     if int64(inputs.tick) == 0:
         begin_common(state.common)
-        state.f = int64(params.f_initial) << 28
+        state.f = int64(params.f_initial) << (Q_F - Q_F_TOP)
         state.a1 = 0
         state.a2 = 0
     e = position_error(inputs)
     ev = speed_error(inputs)
     v = speed_of(inputs)
     wanted = resistance(state, v) + int64(inputs.ahead_acceleration)
-    wanted -= round_shift(int64(common.beta) * ev, 21)
+    wanted -= round_shift(int64(common.beta) * ev, Q_GAIN + Q_ERROR - Q_ACCELERATION)
     wanted += bounds(common, inputs, e, outputs)
-    outputs.estimate[4] = sat32(round_shift(int64(state.f), 28))
-    outputs.estimate[5] = sat32(round_shift(int64(state.a1), 28))
-    outputs.estimate[6] = sat32(round_shift(int64(state.a2), 22))
+    outputs.estimate[4] = sat32(round_shift(int64(state.f), Q_F - Q_F_TOP))
+    outputs.estimate[5] = sat32(round_shift(int64(state.a1), Q_A1 - Q_A1_TOP))
+    outputs.estimate[6] = sat32(round_shift(int64(state.a2), Q_A2 - Q_A2_TOP))
     if limited(common, state.common, inputs, wanted) == 0:
         adapt(params, state, adapting_error(params, e, ev), v)
     outputs.force = clamp(

@@ -19,8 +19,8 @@ import numpy as np
 
 from ato_hil.can_dbc.step import Record, int64, step
 from ato_hil.controller.laws import pid as pid_law
-from ato_hil.controller.laws.pid import pid
-from ato_hil.controller.q import clamp, round_shift, sat32
+from ato_hil.controller.laws.pid import Q_GAIN, pid
+from ato_hil.controller.q import Q_ACCELERATION, Q_SPEED, clamp, round_shift, sat32
 from ato_hil.controller.quantise import Gain, Vehicle, fixed
 
 INITIAL_RUN = True  # runs are numbered from 0
@@ -38,9 +38,9 @@ STATE = pid_law.STATE
 STATE_BOUNDS = pid_law.STATE_BOUNDS
 
 # Learned words: name, unit, Q.
-WORDS = (("u/M", "m/s^2", 27),)
+WORDS = (("u/M", "m/s^2", Q_ACCELERATION),)
 # Estimates in the traces: name, unit, Q.
-ESTIMATES = (*WORDS, ("eps", "m/s", 24))
+ESTIMATES = (*WORDS, ("eps", "m/s", Q_SPEED))
 
 
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -60,14 +60,14 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
     params["initial"] = pid_law.calibrate(
         pid_law.Gains(gp=gains.gp, gI=gains.gI, gD=gains.gD), vehicle
     )
-    params["kp"] = fixed("kp / M", gains.kp / mass, 24)
-    params["kd"] = fixed("kD / (M Ts)", gains.kD / (mass * period), 24)
+    params["kp"] = fixed("kp / M", gains.kp / mass, Q_GAIN)
+    params["kd"] = fixed("kD / (M Ts)", gains.kD / (mass * period), Q_GAIN)
     return params
 
 
 def learned(gains: Gains, vehicle: Vehicle) -> tuple[list[int], list[int], list[int]]:
     """Initial value, lower and upper bound of the learned force: what the actuators give."""
-    force_max = fixed("force_max", vehicle.force_max_m_s2, 27)
+    force_max = fixed("force_max", vehicle.force_max_m_s2, Q_ACCELERATION)
     return [0], [-force_max], [force_max]
 
 
@@ -85,9 +85,8 @@ def pdilc(params: Record, state: Record, cell: Record, inputs: Record, outputs: 
         # |change| < 2^32, so its product with an int32 gain stays inside 64 bits.
         change = eps - int64(state.last)
         state.last = eps
-        increment = round_shift(eps * int64(params.kp), 21) + round_shift(
-            change * int64(params.kd), 21
-        )
+        increment = round_shift(eps * int64(params.kp), Q_SPEED + Q_GAIN - Q_ACCELERATION)
+        increment += round_shift(change * int64(params.kd), Q_SPEED + Q_GAIN - Q_ACCELERATION)
         force_max = int64(params.initial.force_max)
         force = clamp(before + increment, -force_max, force_max)
     cell.learn[0] = sat32(force - before)

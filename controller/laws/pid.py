@@ -17,8 +17,12 @@ import msgspec
 import numpy as np
 
 from ato_hil.can_dbc.step import Record, int64, step
-from ato_hil.controller.q import clamp, round_shift, sat32
+from ato_hil.controller.q import Q_ACCELERATION, Q_SPEED, clamp, round_shift, sat32
 from ato_hil.controller.quantise import Gain, Vehicle, fixed
+
+Q_GAIN = 24  # gp/M, gD/(M Ts), 1/s
+Q_GI = 40  # gI Ts/M, 1/s
+Q_INTEGRAL = 16  # of the estimate, m/s in ticks
 
 PARAMS = np.dtype(
     [
@@ -40,7 +44,7 @@ STATE = np.dtype(
 )
 
 WORDS = ()
-ESTIMATES = (("integral", "m", 16),)
+ESTIMATES = (("integral", "m", Q_INTEGRAL),)
 
 INTEGRAL_MAX = 1 << 40
 STATE_BOUNDS = {"integral": (-INTEGRAL_MAX, INTEGRAL_MAX)}
@@ -59,10 +63,10 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
     format."""
     mass, period = vehicle.mass_kg, vehicle.period_s
     params = np.zeros(1, PARAMS)
-    params["gp"] = fixed("gp / M", gains.gp / mass, 24)
-    params["gi"] = fixed("gI Ts / M", gains.gI * period / mass, 40, 23)
-    params["gd"] = fixed("gD / (M Ts)", gains.gD / (mass * period), 24)
-    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, 27)
+    params["gp"] = fixed("gp / M", gains.gp / mass, Q_GAIN)
+    params["gi"] = fixed("gI Ts / M", gains.gI * period / mass, Q_GI, 23)
+    params["gd"] = fixed("gD / (M Ts)", gains.gD / (mass * period), Q_GAIN)
+    params["force_max"] = fixed("force_max", vehicle.force_max_m_s2, Q_ACCELERATION)
     return params
 
 
@@ -76,12 +80,12 @@ def pid(params: Record, state: Record, cell: Record, inputs: Record, outputs: Re
     integral = clamp(int64(state.integral) + eps, -int64(INTEGRAL_MAX), int64(INTEGRAL_MAX))
     change = eps - int64(state.last)
     wanted = (
-        round_shift(eps * int64(params.gp), 21)
-        + round_shift(integral * int64(params.gi), 37)
-        + round_shift(change * int64(params.gd), 21)
+        round_shift(eps * int64(params.gp), Q_SPEED + Q_GAIN - Q_ACCELERATION)
+        + round_shift(integral * int64(params.gi), Q_SPEED + Q_GI - Q_ACCELERATION)
+        + round_shift(change * int64(params.gd), Q_SPEED + Q_GAIN - Q_ACCELERATION)
     )
     state.integral = integral
     state.last = eps
     outputs.force = clamp(wanted, -int64(params.force_max), int64(params.force_max))
     outputs.status = 0
-    outputs.estimate[0] = sat32(integral >> 8)
+    outputs.estimate[0] = sat32(integral >> (Q_SPEED - Q_INTEGRAL))

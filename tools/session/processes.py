@@ -328,9 +328,10 @@ def run(
 
     `buses` has an entry for each train, and so has `controllers`, or none where the controller is
     one of the `external` nodes; `cars` are those that the plant takes a force for, each by itself;
-    `firmware` is a library for the controllers; `faults` is the folder of can_dbc/fault_receiver.py,
-    `signals` go to the processes when it is time; `others` are further nodes by name, modules with
-    their arguments; `linger` and `interrupts` as in Bench. In lockstep, or in `real_time`.
+    `firmware` is a library for the controllers; `faults` is the folder that
+    `fault_receiver.receiver_of` reads, `signals` go to the processes when it is time; `others` are
+    further nodes by name, modules with their arguments; `linger` and `interrupts` as in Bench. In
+    lockstep, or in `real_time`.
 
     Raises RunError with one line if a node dies, falls silent or reports an error,
     KeyboardInterrupt after Ctrl-C, when no run is in hand.
