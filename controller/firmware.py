@@ -11,7 +11,7 @@ stores the learning memory, nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -92,6 +92,7 @@ from ato_hil.controller.q import (
     round_shift,
     sat32,
 )
+from ato_hil.controller.quantise import CalibrationError, fixed
 
 STATUS_PERIOD = 10  # ticks between ATO_STATUS frames, and between ATO_RADIO frames
 TICK_MASK = 0xFFFF
@@ -150,6 +151,18 @@ CORE_BOUNDS = {
     "stamp": (0, TICK_MASK),
     "sent": (0, e2e.COUNTER_PERIOD - 1),
 }
+
+
+def calibrate_core(mass_kg: float, law: int, exponents: Sequence[int]) -> np.ndarray:
+    """CORE_PARAMS, shape (1,), with the number of the law and the formats of its estimates."""
+    if not mass_kg > 0:
+        raise CalibrationError(f"mass_kg is {mass_kg:g}, expected more than 0")
+    core = np.zeros(1, CORE_PARAMS)
+    core["mass"] = fixed("mass_kg", mass_kg, Q_FORCE)
+    core["law"] = law
+    core["estimates"] = len(exponents)
+    core["exponent"][0, : len(exponents)] = exponents
+    return core
 
 
 def params_dtype(law_params: np.dtype) -> np.dtype:

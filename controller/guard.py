@@ -32,8 +32,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 
+from ato_hil.can_dbc import e2e
 from ato_hil.can_dbc.codec import ATP_LIMIT, values
 from ato_hil.can_dbc.step import (
     Int,
@@ -64,7 +66,13 @@ from ato_hil.controller.interface import (
     GUARD_NORMAL,
     GUARD_SERVICE_BRAKE,
 )
-from ato_hil.controller.q import clamp, sat32
+from ato_hil.controller.plausibility import PlausibleSettings
+from ato_hil.controller.q import INT32_MAX, INT32_MIN, Q_ACCELERATION, Q_SPEED, clamp, sat32
+from ato_hil.controller.quantise import fixed, whole
+
+AGE_MAX_TICKS = 1000
+AHEAD_MAX_TICKS = 10_000
+SLOW_TICKS = 20  # a message that comes every 100 ms may be as much older
 
 # What the guard does about a fault until the next run begins; normal: it is reported, no more.
 REACTIONS = {
@@ -147,6 +155,93 @@ STATE = np.dtype(
     ],
     align=True,
 )
+
+
+# Ends of the scenario's keys, by the format of their numbers.
+UNITS = {Q_ACCELERATION: "_m_s2", Q_SPEED: "_m_s"}
+
+
+class GuardSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the guard tolerates and how it brakes; none turns a limit off."""
+
+    age_max_ticks: int = 10  # an older message brakes
+    counter_jump_max: int = e2e.DELTA_MAX  # MaxDeltaCounter of the end-to-end check
+    service_brake_m_s2: float = 0.8  # of the guard
+    emergency_brake_m_s2: float = 1.2  # of an emergency request; at least the service brake
+    hold_brake_m_s2: float | None = None  # at standstill, while the timetable stands
+    standstill_m_s: float = 0.02  # up to here the train stands
+    overspeed_margin_m_s: float = 2 / 3.6  # above the permitted speed, before traction is cut
+    brake_margin_m_s: float | None = None  # before the service brake comes on
+    emergency_margin_m_s: float | None = None  # before an emergency request
+    cut_ahead_s: float = 0.0  # look-ahead towards ATP's target: traction is cut
+    brake_ahead_s: float = 0.0  # the service brake comes on
+    target_brake_m_s2: float | None = None  # counted on towards it; none: the service brake
+    traction_max_m_s2: float | None = None  # of the command, as specific force
+    brake_max_m_s2: float | None = None  # likewise
+    jerk_max_m_s3: float | None = None  # of the command; brakes of the guard have none
+    acceleration_max_m_s2: float | None = None  # measured: above it the command does not grow
+    plausible: PlausibleSettings = PlausibleSettings()
+
+
+def calibrate(settings: GuardSettings, period_s: float) -> np.ndarray:
+    """PARAMS, shape (1,). Raises CalibrationError for what the firmware does not hold."""
+    params = np.zeros(1, PARAMS)
+    age = whole("control.guard.age_max_ticks", settings.age_max_ticks, 1, AGE_MAX_TICKS)
+    params["age_max"] = age
+    params["control_age_max"] = age + SLOW_TICKS
+    target_brake = settings.target_brake_m_s2
+    if target_brake is None:
+        target_brake = settings.service_brake_m_s2
+    emergency_brake = max(settings.emergency_brake_m_s2, settings.service_brake_m_s2, key=abs)
+    for name, value, q, off in (
+        ("service_brake", _below(settings.service_brake_m_s2), Q_ACCELERATION, 0),
+        ("emergency_brake", _below(emergency_brake), Q_ACCELERATION, 0),
+        ("hold_brake", _below(settings.hold_brake_m_s2), Q_ACCELERATION, 0),
+        ("standstill", settings.standstill_m_s, Q_SPEED, 0),
+        ("overspeed_margin", settings.overspeed_margin_m_s, Q_SPEED, INT32_MAX),
+        ("brake_margin", settings.brake_margin_m_s, Q_SPEED, INT32_MAX),
+        ("emergency_margin", settings.emergency_margin_m_s, Q_SPEED, INT32_MAX),
+        ("target_brake", abs(target_brake), Q_ACCELERATION, 0),
+        ("traction_max", settings.traction_max_m_s2, Q_ACCELERATION, INT32_MAX),
+        ("brake_max", _below(settings.brake_max_m_s2), Q_ACCELERATION, INT32_MIN),
+        ("acceleration_max", settings.acceleration_max_m_s2, Q_ACCELERATION, INT32_MAX),
+        ("period", period_s, 30, 0),
+    ):
+        key = f"control.guard.{name}{UNITS.get(q, '')}"
+        params[name] = off if value is None else fixed(key, value, q, 28 if q == 30 else 32)
+    for name, ahead_s in (
+        ("cut_ahead", settings.cut_ahead_s),
+        ("brake_ahead", settings.brake_ahead_s),
+    ):
+        ticks = round(ahead_s / period_s)
+        params[name] = whole(f"control.guard.{name}_s in ticks", ticks, 0, AHEAD_MAX_TICKS)
+    jerk = settings.jerk_max_m_s3
+    params["force_step"] = (
+        2**32
+        if jerk is None
+        else fixed("control.guard.jerk_max_m_s3", jerk * period_s, Q_ACCELERATION)
+    )
+    return params
+
+
+def _below(value: float | None) -> float | None:
+    """A brake is negative, whatever sign the scenario gives it."""
+    return None if value is None else -abs(value)
+
+
+def calibrate_links(settings: GuardSettings) -> tuple[np.ndarray, np.ndarray]:
+    """What the receivers tolerate: of messages that come every tick, and of those every 100 ms.
+
+    A link that gets a frame now and then stays young but is no longer valid; one that misses frames
+    for less than the largest age stays valid. Noise that hits an identifier twice in a window is
+    chance, three times is not; of a message that comes every tick, a quarter may be corrupt.
+    """
+    jump = whole("control.guard.counter_jump_max", settings.counter_jump_max, 1, e2e.DELTA_ANY)
+    few = max(min(3, e2e.WINDOW - 2 - settings.age_max_ticks), 0)
+    every_tick, slow = np.zeros(1, e2e.SETTING), np.zeros(1, e2e.SETTING)
+    every_tick[0] = (jump, max(few, 1), 2, few, 4, 12, 0, 0)
+    slow[0] = (jump, 1, 1, 0, 2, 1, 1, 0)
+    return every_tick, slow
 
 
 def reaction_ticks(params: Any) -> dict[int, int]:

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ato_hil.can_dbc.step import (
@@ -33,13 +34,16 @@ from ato_hil.can_dbc.step import (
     int64,
     step,
 )
+from ato_hil.controller import reference
 from ato_hil.controller.q import (
     INT32_MAX,
+    Q_POSITION,
     clamp,
     divide_round,
     round_shift,
     sat32,
 )
+from ato_hil.controller.quantise import CalibrationError, Recall, fixed, whole
 
 WORDS_MAX = 22
 AHEAD_WORDS = 2
@@ -95,6 +99,57 @@ MEMORY_STATE = np.dtype(
 )
 
 TOTAL_MAX = 1 << 48  # where the sum of a cell that no longer closes stops
+
+
+class MemorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Grid of the learning memory; a law that recalls the last run has one int32 cell a tick, one
+    that learns along the track an int32 cell every pitch of its own, whatever this says."""
+
+    decimation: int = 1  # control periods a cell
+    lead_ticks: int = 0  # what a tick learns from lies so far ahead
+    interpolation: str = "hold"  # hold | linear
+    storage: str = "int32"  # int32 | int16
+
+
+def calibrate(params: np.ndarray, settings: MemorySettings, ticks: int) -> np.ndarray:
+    """`params`, which have what a law says of its words, with the grid as well."""
+    params["scale"] = 1
+    if params["words"] == 0:
+        return params
+    decimation = whole("control.memory.decimation", settings.decimation, 1, ticks)
+    lead = whole("control.memory.lead_ticks", settings.lead_ticks, 0, ticks)
+    if settings.interpolation not in ("hold", "linear"):
+        raise CalibrationError(
+            f"control.memory.interpolation is {settings.interpolation!r}, expected hold or linear"
+        )
+    if settings.storage not in ("int32", "int16"):
+        raise CalibrationError(
+            f"control.memory.storage is {settings.storage!r}, expected int32 or int16"
+        )
+    params["cells"] = -(-ticks // decimation)
+    params["decimation"] = decimation
+    params["lead"] = lead
+    params["linear"] = int(settings.interpolation == "linear")
+    params["weight"] = round(2**30 / (2 * decimation))
+    params["scale"] = 1 if settings.storage == "int32" else 2**16
+    return params
+
+
+def calibrate_recall(params: np.ndarray, recall: Recall) -> None:
+    """Adds to the params what a law sees of the last run."""
+    params["recall"] = 1
+    params["ahead"] = recall.ahead_ticks
+    params["smooth"] = recall.smooth_ticks
+    params["smooth_word"] = recall.smooth_word
+    params["smooth_weight"] = round(2**30 / (2 * recall.smooth_ticks + 1))
+    params["late_word"] = recall.late_word
+
+
+def calibrate_along_track(params: np.ndarray, pitch_m: float, profile: np.ndarray) -> None:
+    """Lays the cells along the track, so that all of the profile lies between cells."""
+    pitch = fixed("pitch_m", pitch_m, Q_POSITION)
+    params["pitch"] = pitch
+    params["cells"] = -(-reference.length(profile) // (pitch << 25)) + 1
 
 
 def state_bounds(params: Any) -> dict[str, tuple[int, int]]:

@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ato_hil.can_dbc.step import (
@@ -35,6 +36,8 @@ from ato_hil.controller.interface import (
     FAULT_PROGRESS,
     FAULT_SPEED_IMPLAUSIBLE,
 )
+from ato_hil.controller.q import INT32_MAX, INT32_MIN, Q_POSITION, Q_SPEED
+from ato_hil.controller.quantise import CalibrationError, fixed, whole
 
 PARAMS = np.dtype(
     [
@@ -69,6 +72,7 @@ STATE = np.dtype(
     align=True,
 )
 
+WINDOW_MAX = 1000  # ticks
 TICKS_MAX = 1 << 16  # where the ages of the samples stop; a link is lost long before
 TRAVELLED_MAX = 1 << 50  # where the sum stops, far outside of what a window can hold
 STATE_BOUNDS = {
@@ -77,6 +81,48 @@ STATE_BOUNDS = {
     "speed_ticks": (0, TICKS_MAX),
     "position_ticks": (0, TICKS_MAX),
 }
+
+
+class PlausibleSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the guard believes of the sensors: more than any train does."""
+
+    speed_max_m_s: float = 127.0  # either way
+    speed_jump_m_s: float = 0.5  # what noise may add from one sample to the next
+    acceleration_max_m_s2: float = 5.0  # between samples, either way
+    # Before the start and beyond the end of the timetable; none: what the sensor can say.
+    position_margin_m: float | None = None
+    position_jump_m: float = 1.0  # what noise may add
+    progress_max_m: float = 0.5  # of the position against the sum of the speed
+    window_s: float = 2.0  # over which they are compared
+
+
+def calibrate(
+    settings: PlausibleSettings, period_s: float, start_m: float, distance_m: float
+) -> np.ndarray:
+    """PARAMS for a timetable that starts at `start_m` and is `distance_m` long."""
+    params = np.zeros(1, PARAMS)
+    where = "control.guard.plausible."
+    margin = 2.0**17 if settings.position_margin_m is None else settings.position_margin_m
+    low, high = start_m - margin, start_m + distance_m + margin
+    for name, key, value, q in (
+        ("speed_min", "speed_max_m_s", -settings.speed_max_m_s, Q_SPEED),
+        ("speed_max", "speed_max_m_s", settings.speed_max_m_s, Q_SPEED),
+        ("speed_jump", "speed_jump_m_s", settings.speed_jump_m_s, Q_SPEED),
+        ("speed_step", "acceleration_max_m_s2", settings.acceleration_max_m_s2 * period_s, Q_SPEED),
+        ("position_jump", "position_jump_m", settings.position_jump_m, Q_POSITION),
+        ("position_step", "speed_max_m_s", settings.speed_max_m_s * period_s, Q_POSITION),
+        ("progress_max", "progress_max_m", settings.progress_max_m, Q_POSITION),
+        ("period", "period_s", period_s, 30),
+    ):
+        if value < 0 and name != "speed_min":
+            raise CalibrationError(f"{where}{key} is {value:g}, expected 0 or more")
+        params[name] = fixed(f"{where}{key}", value, q, 28 if q == 30 else 32)
+    # Beyond what the firmware holds the sensor's own range is the limit.
+    for name, limit in (("position_min", low), ("position_max", high)):
+        params[name] = min(max(round(limit * 2**Q_POSITION), INT32_MIN), INT32_MAX)
+    window = round(settings.window_s / period_s)
+    params["window"] = whole(f"{where}window_s in ticks", window, 1, WINDOW_MAX)
+    return params
 
 
 def reaction_ticks(params: Any, wrong_m_s: float) -> int | None:

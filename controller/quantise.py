@@ -56,6 +56,13 @@ def check_bounds(key: str, low: float, high: float) -> None:
         raise ValueError(f"{key}: {low:g} to {high:g}, expected the lower bound first")
 
 
+def whole(key: str, value: int, low: int, high: int) -> int:
+    """`value`, if it lies within the bounds; else raises CalibrationError."""
+    if not low <= value <= high:
+        raise CalibrationError(f"{key} is {value}, expected {low} to {high}")
+    return value
+
+
 def fixed(key: str, value: float, q: int, bits: int = 32) -> int:
     """`value` in units of 2**-q as a signed integer of `bits`; raises CalibrationError if it does
     not fit."""

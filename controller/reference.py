@@ -28,6 +28,7 @@ from ato_hil.can_dbc.step import (
     step,
 )
 from ato_hil.controller.q import INT32_MAX, clamp, round_shift, sat32
+from ato_hil.controller.quantise import CalibrationError, whole
 
 SEGMENT = np.dtype([("ticks", np.int32), ("jerk", np.int32)], align=True)
 
@@ -63,6 +64,19 @@ REFERENCE_PARAMS = np.dtype(
 PREVIEW_MAX = 128
 Q_RATE = 24
 ONE = 1 << Q_RATE
+
+
+def calibrate(period_s: float, profile: np.ndarray, preview_ticks: int) -> np.ndarray:
+    """REFERENCE_PARAMS, shape (1,), of a profile, [n] of SEGMENT."""
+    params = np.zeros(1, REFERENCE_PARAMS)
+    speed, acceleration = 3 / period_s, 6 / period_s**2
+    if abs(speed - round(speed)) > 1e-6 or abs(acceleration - round(acceleration)) > 1e-3:
+        raise CalibrationError(f"period_s is {period_s:g}, expected one that divides 1 s")
+    params["speed_factor"] = round(speed)
+    params["acceleration_factor"] = round(acceleration)
+    params["segment_count"] = len(profile)
+    params["preview"] = whole("control.preview_ticks", preview_ticks, 0, PREVIEW_MAX)
+    return params
 
 
 def cursor_bounds(params: Any) -> dict[str, tuple[int, int]]:

@@ -8,14 +8,11 @@ import pytest
 
 from ato_hil.can_dbc import e2e
 from ato_hil.controller import calibration, distribution, reference
-from ato_hil.controller.calibration import (
-    GuardSettings,
-    Line,
-    MemorySettings,
-    PlausibleSettings,
-)
-from ato_hil.controller.memory import initial_memory
+from ato_hil.controller.calibration import Line
+from ato_hil.controller.guard import GuardSettings
+from ato_hil.controller.memory import MemorySettings, initial_memory
 from ato_hil.controller.neighbours import NeighbourSettings
+from ato_hil.controller.plausibility import PlausibleSettings
 from ato_hil.controller.quantise import CalibrationError, Vehicle, fixed
 from ato_hil.controller.rebasing import RebasingSettings
 from ato_hil.controller.reference import (
@@ -143,7 +140,7 @@ def test_an_emergency_brake_is_no_weaker_than_the_service_brake():
 
 
 def test_positions_are_believed_around_the_timetable():
-    length = calibration.length_m(PROFILE)
+    length = reference.length(PROFILE) / 2**40
     settings = GuardSettings(plausible=PlausibleSettings(position_margin_m=100.0))
     believed = calibrate(guard_settings=settings).params[0]["plausibility"]
     assert believed["position_min"] == -100 * 2**15
@@ -163,7 +160,7 @@ def test_the_length_of_a_profile_is_where_its_cursor_ends():
     rewind(cursor[0], PROFILE, 0)
     for _ in range(600):
         advance(params[0], cursor[0], PROFILE)
-    assert calibration.length_m(PROFILE) == cursor["x"][0] / 2**40
+    assert reference.length(PROFILE) == cursor["x"][0]
 
 
 def test_links_that_miss_frames_for_less_than_the_largest_age_stay_valid():

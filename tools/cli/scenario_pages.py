@@ -17,7 +17,8 @@ import msgspec
 from msgspec import inspect as kinds
 
 from ato_hil.can_dbc.errors import validation
-from ato_hil.controller.calibration import GuardSettings, MemorySettings
+from ato_hil.controller.guard import GuardSettings
+from ato_hil.controller.memory import MemorySettings
 from ato_hil.controller.neighbours import NeighbourSettings
 from ato_hil.controller.rebasing import RebasingSettings
 from ato_hil.controller.registry import law_names, load_law

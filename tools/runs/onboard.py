@@ -10,13 +10,9 @@ import numpy as np
 
 from ato_hil.can_dbc.codec import MESSAGES
 from ato_hil.can_dbc.errors import expected, validation
-from ato_hil.controller.calibration import (
-    Calibration,
-    GuardSettings,
-    Line,
-    MemorySettings,
-    calibrate,
-)
+from ato_hil.controller.calibration import Calibration, Line, calibrate
+from ato_hil.controller.guard import GuardSettings
+from ato_hil.controller.memory import MemorySettings
 from ato_hil.controller.neighbours import NeighbourSettings
 from ato_hil.controller.node import Controller, build
 from ato_hil.controller.quantise import CalibrationError, Characteristic, Vehicle

@@ -19,17 +19,15 @@ from ato_hil.controller import (
     guard,
     node,
 )
-from ato_hil.controller.calibration import (
-    GuardSettings,
-    Line,
-    MemorySettings,
-    PlausibleSettings,
-)
+from ato_hil.controller.calibration import Line
+from ato_hil.controller.guard import GuardSettings
 from ato_hil.controller.interface import (
     ARMED,
     RUNNING,
 )
+from ato_hil.controller.memory import MemorySettings
 from ato_hil.controller.neighbours import NeighbourSettings
+from ato_hil.controller.plausibility import PlausibleSettings
 from ato_hil.controller.quantise import Vehicle
 from ato_hil.controller.rebasing import RebasingSettings
 from ato_hil.controller.reference import SEGMENT

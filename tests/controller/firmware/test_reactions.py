@@ -17,7 +17,7 @@ from ato_hil.controller import (
     distribution,
     guard,
 )
-from ato_hil.controller.calibration import GuardSettings
+from ato_hil.controller.guard import GuardSettings
 from ato_hil.controller.interface import (
     BRAKE,
     COAST,

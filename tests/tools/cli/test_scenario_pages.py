@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from ato_hil.controller.calibration import GuardSettings
+from ato_hil.controller.guard import GuardSettings
 from ato_hil.plant_sim.actuator import Actuator
 from ato_hil.plant_sim.scenario import (
     Scenario,
