@@ -16,6 +16,9 @@ Slip is what a wheel does to an odometer: it measures `1 + share` times the spee
 goes on in the position afterwards; a negative share is a wheel that slides, -1 one that is locked.
 The sensor's quantisation comes after its failures; they touch nothing of the train's true state.
 The failing actuators are those that the controller commands, not the safety brakes of ATP.
+
+The faults of a scenario's line (`[[line.faults]]`: a train that loses traction, or brakes unasked)
+are rows of the same table.
 """
 
 from __future__ import annotations
@@ -36,8 +39,10 @@ from ato_hil.can_dbc.faults import (
     ticks_of,
 )
 from ato_hil.can_dbc.step import int64, step
+from ato_hil.plant_sim.atp import EMERGENCY_BRAKE
+from ato_hil.plant_sim.line import Fault
 
-FAILURES_MAX = 16
+FAILURES_MAX = 16  # of a file
 CARS_MAX = 8
 ANY_RUN = -1
 NEVER = 2**62  # tick
@@ -106,23 +111,34 @@ AnyFailure = AnySensor | AnyActuator
 
 KINDS: tuple[type, ...] = (Stuck, Drift, Offset, Noise, Slip, Traction, Brake)
 STUCK, DRIFT, OFFSET, NOISE, SLIP, TRACTION, BRAKE = range(len(KINDS))
+CAPPED, BRAKING = len(KINDS), len(KINDS) + 1  # faults of a line: one of each kind for a train
+ROWS = FAILURES_MAX + 2
 
 ROW = np.dtype(
     [
-        ("kind", np.int64),  # STUCK .. BRAKE
+        ("kind", np.int64),  # STUCK .. BRAKING
         ("quantity", np.int64),  # SPEED, POSITION
         ("run", np.int64),  # number, or ANY_RUN
         ("first", np.int64),  # tick
         ("end", np.int64),  # first tick after it
-        ("value", np.float64),  # rate in a tick, offset, deviation, or share
+        # Rate in a tick, offset, deviation, share; CAPPED: N; BRAKING: m/s^2.
+        ("value", np.float64),
+        ("supervision", np.int64),  # BRAKING: what ATP says meanwhile
     ]
 )
 
-PARAMS = np.dtype([("count", np.int64), ("row", ROW, (FAILURES_MAX,)), ("period_s", np.float64)])
+PARAMS = np.dtype(
+    [
+        ("count", np.int64),
+        ("row", ROW, (ROWS,)),
+        ("period_s", np.float64),
+        ("mass_kg", np.float64),
+    ]
+)
 
 STATE = np.dtype(
     [
-        ("held", np.float64, (FAILURES_MAX,)),  # what a stuck sensor says
+        ("held", np.float64, (ROWS,)),  # what a stuck sensor says
         ("slipped_m", np.float64),  # of the odometer
         ("commanded_n", np.float64, (CARS_MAX,)),
     ]
@@ -147,12 +163,36 @@ def of_folder(folder: Path | None) -> list[AnyFailure]:
     return [] if folder is None else load(folder / SOURCE_FILE)
 
 
-def calibrate(failures: Sequence[AnyFailure], train: int, period_s: float) -> np.ndarray:
-    """PARAMS, shape (1,), of a train, 0 leads."""
+def calibrate(
+    failures: Sequence[AnyFailure],
+    train: int,
+    period_s: float,
+    *,
+    faults: Sequence[Fault] = (),
+    mass_kg: float = 0.0,
+    force_max_m_s2: float = 0.0,
+) -> np.ndarray:
+    """PARAMS, shape (1,), of a train, 0 leads; `faults` are those of its line."""
     params = np.zeros(1, PARAMS)
     params["period_s"] = period_s
+    params["mass_kg"] = mass_kg
     rows = params["row"][0]
     count = 0
+    for fault in sorted(faults, key=lambda fault: fault.traction_share is None):
+        if fault.train != train + 1:
+            continue
+        row = rows[count]
+        row["run"] = ANY_RUN
+        row["first"] = round(fault.from_s / period_s)
+        row["end"] = round(min(fault.to_s / period_s, NEVER))
+        if fault.traction_share is not None:
+            row["kind"] = CAPPED
+            row["value"] = fault.traction_share * (force_max_m_s2 * mass_kg)
+        else:
+            row["kind"] = BRAKING
+            row["value"] = fault.brake_m_s2
+            row["supervision"] = EMERGENCY_BRAKE if fault.emergency else 0
+        count += 1
     for each in failures:
         if each.train not in (None, train + 1):
             continue
@@ -161,7 +201,7 @@ def calibrate(failures: Sequence[AnyFailure], train: int, period_s: float) -> np
             quantity = QUANTITIES.get(getattr(each, "quantity", ""), 0)
             rows[count] = (
                 *(KINDS.index(type(each)), quantity, run, first, min(end, NEVER)),
-                _value(each, period_s),
+                *(_value(each, period_s), 0),
             )
             count += 1
     params["count"] = count
@@ -248,7 +288,19 @@ def measured(
 
 
 @step
-def weaken(params: Any, state: Any, node: Any) -> None:
+def braking(params: Any, node: Any) -> Any:
+    """What ATP says, if a fault of the line brakes in this tick; else -1."""
+    tick, run = int64(node.tick), int64(node.iteration)
+    says = int64(-1)
+    for i in range(int64(params.count)):
+        row = params.row[i]
+        if int64(row.kind) == BRAKING and is_on(row, tick, run) != 0:
+            says = int64(row.supervision)
+    return says
+
+
+@step
+def weaken(params: Any, state: Any, node: Any, train: Any) -> None:
     """What actuators make of the commands; `restore` follows, because a command that is held must
     not be weakened again."""
     tick, run = int64(node.tick), int64(node.iteration)
@@ -259,6 +311,13 @@ def weaken(params: Any, state: Any, node: Any) -> None:
         row = params.row[i]
         if is_on(row, tick, run) == 0:
             continue
+        if int64(row.kind) == CAPPED:
+            command_n[0] = min(command_n[0], row.value)
+        elif int64(row.kind) == BRAKING:
+            force = -params.mass_kg * row.value
+            if train.speed_m_s > 0.0:  # the train's resistance brakes as well
+                force += train.force_n - params.mass_kg * train.acceleration_m_s2
+            command_n[0] = force
         for k in range(CARS_MAX):
             if int64(row.kind) == TRACTION and command_n[k] > 0.0:
                 command_n[k] *= row.value

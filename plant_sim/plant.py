@@ -97,15 +97,7 @@ NODE_PARAMS = np.dtype(
         ("rear_weight", np.float64),  # 0: sensor at the front, 0.5: mean of front and rear
         ("rear_offset_m", np.float64),  # distance of front and rear at rest
         ("recuperation", np.float64),  # part of the braking work that comes back
-        ("mass_kg", np.float64),
         ("holding_force_n", np.float64),  # of the actuators when a run begins
-        ("weak_from", np.int64),  # first tick of lost traction
-        ("weak_to", np.int64),  # first tick after it
-        ("weak_force_n", np.float64),  # largest traction that is left
-        ("brake_from", np.int64),  # the same of a brake that nobody commanded
-        ("brake_to", np.int64),
-        ("brake_m_s2", np.float64),  # deceleration that it holds
-        ("brake_supervision", np.int64),  # what ATP says meanwhile
         ("command_age_max", np.int64),  # ticks; with an older command the vehicle brakes
     ],
     align=True,
@@ -279,12 +271,6 @@ def read_cars(node: Any, rx: Any, first: Any, message: Any, one: Any, other: Any
 
 
 @step
-def fault_brakes(params: Any, tick: Any) -> Any:
-    """Whether a fault of the scenario brakes."""
-    return tick >= params.brake_from and tick < params.brake_to
-
-
-@step
 def order_brakes(params: Any, state: Any) -> None:
     """What ATP, the controller's mode and the age of the command ask of the safety brakes."""
     node = state.node
@@ -297,8 +283,8 @@ def order_brakes(params: Any, state: Any) -> None:
     lost = node.command_age > params.node.command_age_max
     holds = node.mode == HOLD and stands
     service = state.atp.service != 0 or lost or holds
-    # A brake of the scenario's own is the one that is requested.
-    requested = node.emergency_requested != 0 and not fault_brakes(params.node, int64(node.tick))
+    # A train that brakes by a fault of its line does not brake once more for the request.
+    requested = node.emergency_requested != 0 and failures.braking(params.failures, node) < 0
     emergency = state.atp.emergency != 0 or requested
     brakes.order(
         state.brakes,
@@ -309,28 +295,13 @@ def order_brakes(params: Any, state: Any) -> None:
 
 
 @step
-def fail(params: Any, node: Any, train: Any) -> None:
-    """What the scenario's faults make of the command: less traction, or a brake."""
-    tick = int64(node.tick)
-    if tick >= params.weak_from and tick < params.weak_to:
-        node.command_n[0] = min(node.command_n[0], params.weak_force_n)
-    if fault_brakes(params, tick):
-        force = -params.mass_kg * params.brake_m_s2
-        if train.speed_m_s > 0.0:  # the train's resistance brakes as well
-            force += train.force_n - params.mass_kg * train.acceleration_m_s2
-        node.command_n[0] = force
+def demand(params: Any, state: Any) -> Any:
+    """What ATP demands, or a fault of the line says that it does."""
+    return max(failures.braking(params.failures, state.node), int64(state.atp.demand))
 
 
 @step
-def demand(params: Any, state: Any, tick: Any) -> Any:
-    """What ATP demands, or the scenario's fault says that it does."""
-    if fault_brakes(params, tick):
-        return max(int64(params.brake_supervision), int64(state.atp.demand))
-    return int64(state.atp.demand)
-
-
-@step
-def limit_word(params: Any, state: Any, tick: Any) -> Any:
+def limit_word(params: Any, state: Any) -> Any:
     """ATP_LIMIT."""
     supervised = state.atp
     distance = int64(NO_TARGET_M)
@@ -342,7 +313,7 @@ def limit_word(params: Any, state: Any, tick: Any) -> Any:
         put(ATP_LIMIT.PermittedSpeed, permitted)
         + put(ATP_LIMIT.TargetSpeed, target)
         + put(ATP_LIMIT.TargetDistance, distance)
-        + put(ATP_LIMIT.Supervision, demand(params, state, tick))
+        + put(ATP_LIMIT.Supervision, demand(params, state))
     )
 
 
@@ -386,7 +357,7 @@ def sense_train(params: Any, limits: Any, state: Any, chance: Any, tx: Any) -> N
     atp.supervise(params.atp, limits, state.atp, tick, train.position_m, train.speed_m_s)
     if tick % CONTROL_PERIOD_TICKS == 0:
         e2e.send(node, tx, RUN_CTRL, control_word(node))
-    e2e.send(node, tx, ATP_LIMIT, limit_word(setting, state, tick))
+    e2e.send(node, tx, ATP_LIMIT, limit_word(params, state))
     rear = setting.rear_weight
     position = train.position_m + rear * (
         train.rear_position_m + setting.rear_offset_m - train.position_m
@@ -417,7 +388,7 @@ def sense_train(params: Any, limits: Any, state: Any, chance: Any, tx: Any) -> N
 @step
 def read_train(params: Any, state: Any, rx: Any, truth: Any) -> None:
     """Before a train model takes its command: the row of truth at the start of the tick, and the
-    command as the scenario's faults leave it."""
+    command as what fails leaves it."""
     node = state.node
     train = state.train
     truth.position_m = train.position_m
@@ -430,8 +401,7 @@ def read_train(params: Any, state: Any, rx: Any, truth: Any) -> None:
     read_commands(params.node, node, rx)
     truth.command_age_ticks = node.command_age * 1.0
     radio.read(node, state.radio, rx)
-    fail(params.node, node, train)
-    failures.weaken(params.failures, state.failures, node)
+    failures.weaken(params.failures, state.failures, node, train)
 
 
 @step

@@ -23,13 +23,12 @@ from ato_hil.plant_sim import (
     plant,
     track,
 )
-from ato_hil.plant_sim.line import TRAINS_MAX, Fault
+from ato_hil.plant_sim.line import TRAINS_MAX
 from ato_hil.plant_sim.profile import RATE_ONE, rate_of, stretched_ticks
 from ato_hil.plant_sim.scenario import (
     MODELS,
     Loaded,
     RunLength,
-    Scenario,
     Start,
     at_rate,
     in_run,
@@ -64,7 +63,7 @@ class World:
     track: Any  # [n] of track.SECTION
     rx: Any  # [trains, MESSAGE_COUNT] mailboxes
     tx: Any
-    noisy: bool  # random numbers are drawn for a sensor whatever the scenario says
+    fails: Sequence[failures.AnyFailure]  # beside the faults of the scenario's line
 
     def ticks(self, run: int) -> int:
         """Control periods of a run."""
@@ -79,9 +78,7 @@ class World:
         if changed or before.start != Start():
             for train in self.members:
                 offset_m = start_offset_m(train, self.seed, run)
-                own = _params(train, self.model, offset_m)[0]
-                own["failures"] = self.params[train.train]["failures"]
-                self.params[train.train] = own
+                self.params[train.train] = _params(train, self.model, self.fails, offset_m)[0]
             self.track = rows(track.sections(self.members[0].scenario.track))
         rate = timetable_rate(self.members[0], self.seed, run)
         if changed or rate != int(self.state[0]["node"]["timetable_rate"]):
@@ -102,9 +99,7 @@ def build(loaded: Loaded, seed: int, fails: Sequence[failures.AnyFailure] = ()) 
     begin, sense, actuate_and_advance = plant.build(model)
     params = np.zeros(len(trains), plant.params_dtype(model.PARAMS))
     for train in trains:
-        params[train.train] = _params(train, model)[0]
-        own = failures.calibrate(fails, train.train, scenario.period_s)
-        params["failures"][train.train] = own[0]
+        params[train.train] = _params(train, model, fails)[0]
     boxes = (len(trains), MESSAGE_COUNT)
     return World(
         planned=trains,
@@ -120,11 +115,13 @@ def build(loaded: Loaded, seed: int, fails: Sequence[failures.AnyFailure] = ()) 
         track=rows(track.sections(scenario.track)),
         rx=rows(np.zeros(boxes, MAILBOX)),
         tx=rows(np.zeros(boxes, MAILBOX)),
-        noisy=failures.needs_noise(fails),
+        fails=fails,
     )
 
 
-def _params(loaded: Loaded, model: Any, offset_m: float = 0.0) -> np.ndarray:
+def _params(
+    loaded: Loaded, model: Any, fails: Sequence[failures.AnyFailure], offset_m: float = 0.0
+) -> np.ndarray:
     """PARAMS, shape (1,), of one train that stands `offset_m` off its mark when a run begins."""
     scenario = loaded.scenario
     train = scenario.train
@@ -138,7 +135,6 @@ def _params(loaded: Loaded, model: Any, offset_m: float = 0.0) -> np.ndarray:
         scenario.actuator, train.mass_kg, scenario.period_s, scenario.period_s / train.substeps
     )
     node = params["node"]
-    node["mass_kg"] = train.mass_kg
     cars = len(train.effectiveness)
     node["cars"] = cars if scenario.control.distribute else 0
     node["effectiveness"][0, :cars] = train.effectiveness
@@ -168,23 +164,13 @@ def _params(loaded: Loaded, model: Any, offset_m: float = 0.0) -> np.ndarray:
         radio["period"] = scenario.line.radio.period_ticks
         radio["delay"] = scenario.line.radio.delay_ticks
         radio["age_factor"] = scenario.period_s / NEIGHBOUR_AHEAD_POSITION.Age.scale
-        for fault in scenario.line.faults:
-            if fault.train == loaded.train + 1:
-                _fail(node, fault, scenario)
+    params["failures"] = failures.calibrate(
+        *(fails, loaded.train, scenario.period_s),
+        faults=scenario.line.faults if scenario.line else (),
+        mass_kg=train.mass_kg,
+        force_max_m_s2=scenario.actuator.force_max_m_s2,
+    )
     return params
-
-
-def _fail(node: np.ndarray, fault: Fault, scenario: Scenario) -> None:
-    """A fault of a train as NODE_PARAMS."""
-    kind = "brake" if fault.traction_share is None else "weak"
-    node[f"{kind}_from"] = round(fault.from_s / scenario.period_s)
-    node[f"{kind}_to"] = round(min(fault.to_s / scenario.period_s, NEVER))
-    if fault.traction_share is not None:
-        largest_n = scenario.actuator.force_max_m_s2 * scenario.train.mass_kg
-        node["weak_force_n"] = fault.traction_share * largest_n
-    else:
-        node["brake_m_s2"] = fault.brake_m_s2
-        node["brake_supervision"] = atp.EMERGENCY_BRAKE if fault.emergency else 0
 
 
 def supervised(loaded: Loaded) -> atp.Limits:
@@ -327,7 +313,8 @@ def _noise(generator: np.random.Philox, ticks: int) -> np.ndarray:
 
 def chances(here: World, run: int) -> Any:
     """Random numbers of a run, [trains, ticks] of plant.CHANCE, for the steps."""
-    return rows(np.stack([chance(train, here.seed, run, here.noisy) for train in here.members]))
+    noisy = failures.needs_noise(here.fails)
+    return rows(np.stack([chance(train, here.seed, run, noisy) for train in here.members]))
 
 
 def chance(loaded: Loaded, seed: int, run: int, noisy: bool = False) -> np.ndarray:

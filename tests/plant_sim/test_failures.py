@@ -10,6 +10,7 @@ import pytest
 
 from ato_hil.can_dbc.faults import FaultError, Planned
 from ato_hil.plant_sim import failures, plant
+from ato_hil.plant_sim.trains import point
 
 PERIOD_S = 0.01
 
@@ -24,6 +25,7 @@ class Train:
         self.params = failures.calibrate(self.failures, train, PERIOD_S)
         self.state = np.zeros(1, failures.STATE)
         self.node = np.zeros(1, plant.NODE_STATE)
+        self.motion = np.zeros(1, point.STATE)
         failures.reset(self.state[0])
 
     def measure(self, tick: int, speed: float, position: float, noise: float = 0.0, run: int = 1):
@@ -36,7 +38,7 @@ class Train:
     def weaken(self, tick: int, *command_n: float, run: int = 1) -> list[float]:
         self.node["tick"], self.node["iteration"] = tick, run
         self.node["command_n"][0, : len(command_n)] = command_n
-        failures.weaken(self.params[0], self.state[0], self.node[0])
+        failures.weaken(self.params[0], self.state[0], self.node[0], self.motion[0])
         weak: list[float] = self.node["command_n"][0, : len(command_n)].tolist()
         failures.restore(self.state[0], self.node[0])
         assert self.node["command_n"][0, : len(command_n)].tolist() == list(command_n)
