@@ -1,7 +1,8 @@
-"""Acceptance of paper 3, five trains on one line: every row of its table, through the whole chain.
+"""Acceptance of paper 3, five trains on one line, through the whole chain: what its table of claims
+does not say (test_claims.py).
 
 E are the gains for a plant with lag, delay, noise and limited jerk (scenario `line`), the others
-are the paper's (`line-paper`). Thresholds are the table's.
+are the paper's (`line-paper`).
 """
 
 from __future__ import annotations
@@ -14,9 +15,7 @@ from ato_hil.tools.papers.mtcc.claims import (
     ALL_2,
     ALL_4,
     ALONE,
-    DAMPED,
     DELAY,
-    FAULTS,
     INERT,
     LAG,
     LAG_2,
@@ -48,26 +47,15 @@ def error_m(base: str, text: str = "", law: str = POC, seed: int = 1) -> float:
 # Rows of the table.
 
 
-@pytest.mark.parametrize(("text", "bound_m"), [(NOMINAL, 0.080), (LAG_2, 0.075), (LAG_4, 0.080)])
-def test_the_embedded_gains_stay_inside(text: str, bound_m: float) -> None:
-    assert error_m("line", text) <= bound_m
-
-
-@pytest.mark.parametrize(("text", "bound_m"), [(ALL_2, 0.080), (ALL_4, 0.090)])
-def test_the_embedded_gains_stay_inside_with_everything_on(text: str, bound_m: float) -> None:
-    assert error_m("line", text) <= bound_m
+@pytest.mark.parametrize("text", [LAG_4, ALL_2], ids=["lag .4", "all, lag .2"])
+def test_the_embedded_gains_stay_inside(text: str) -> None:
+    assert error_m("line", text) <= 0.080
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(("text", "bound_m"), [(ALL_2, 0.080), (ALL_4, 0.090)])
 def test_the_embedded_gains_stay_inside_with_any_seed(text: str, bound_m: float) -> None:
     assert max(error_m("line", text, seed=seed) for seed in SEEDS) <= bound_m
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("text", "bound_m"), [(NOMINAL, 0.135), (ALL_4, 0.140)])
-def test_the_single_parameter_law_stays_inside(text: str, bound_m: float) -> None:
-    assert error_m("line", text, SVL) <= bound_m
 
 
 @pytest.mark.long
@@ -79,12 +67,8 @@ def test_fixed_point_follows_float_on_every_train(law: str, text: str) -> None:
     assert position_m <= 1e-5
 
 
-def test_more_damping_stands_a_tick_of_delay() -> None:
-    assert error_m("line-paper", DELAY + DAMPED) <= 0.020
-
-
-def test_without_consensus_the_printed_gains_leave_the_barrier() -> None:
-    assert 100 <= run("line-paper", ALONE).outside_at_s < 300
+def test_without_consensus_the_printed_gains_leave_the_barrier_late() -> None:
+    assert run("line-paper", ALONE).outside_at_s >= 100
 
 
 def test_every_train_comes_back_from_two_metres() -> None:
@@ -96,17 +80,6 @@ def test_every_train_comes_back_from_two_metres() -> None:
     assert "timetable re-based" not in far.faults
 
 
-def test_a_poor_radio_costs_nothing() -> None:
-    assert error_m("line", POOR_LAG_2) - error_m("line", LAG_2) <= 0.005
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_the_separation_outlives_a_fault(name: str) -> None:
-    row = run("line", POOR_LAG_2 + fault(name)).row
-    assert row["min_separation_m"] > 425
-    assert row["max_separation_m"] < 585
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("lag_s", [0.2, 0.4])
 @pytest.mark.parametrize("name", ["F2", "F2a", "F2b", "F3"])
@@ -116,13 +89,6 @@ def test_the_separation_outlives_a_fault_with_everything_on(name: str, lag_s: fl
     ]
     assert min(row["min_separation_m"] for row in rows) > 400
     assert max(row["max_separation_m"] for row in rows) < 600
-
-
-@pytest.mark.long
-def test_the_pid_has_the_range_of_the_reading() -> None:
-    pid = run("line-pid")
-    assert -pid.least_error_m.min() == pytest.approx(1.56, abs=0.1)
-    assert -pid.largest_error_m.max() == pytest.approx(-1.08, abs=0.1)
 
 
 # The paper's gains on the ideal plant: what holds and what does not.
@@ -138,9 +104,9 @@ def test_the_printed_gains_of_the_single_parameter_law_keep_the_barrier() -> Non
     assert error_m("line-paper", law=SVL) == pytest.approx(0.0625, abs=0.005)
 
 
-@pytest.mark.parametrize("law", BOTH_LAWS)
-def test_the_printed_gains_keep_the_separation(law: str) -> None:
-    row = run("line-paper", law=law).row
+@pytest.mark.long
+def test_the_printed_gains_of_the_single_parameter_law_keep_the_separation() -> None:
+    row = run("line-paper", law=SVL).row
     assert row["min_separation_m"] > 509.5
     assert row["max_separation_m"] < 510.5
 
@@ -194,7 +160,6 @@ def test_a_dead_radio_is_survived() -> None:
 
 
 def test_the_default_line_shows_what_it_is_for() -> None:
-    assert error_m("line") <= 0.080
     failure = run("line-failure")
     assert failure.row["min_separation_m"] > 425
     assert failure.row["max_separation_m"] < 585

@@ -1,4 +1,4 @@
-"""Paper 1 through the whole chain (SIL): what is claimed, what holds, what must be seen to fail.
+"""Paper 1 through the whole chain (SIL): what its table of claims does not say (test_claims.py).
 
 Errors are of the front car's true state; "worst" is over runs 1 to 10, d the largest augmented
 error. A noise or load disturbance is that of seed 1. Rows A3 and A4 are those of the baselines.
@@ -6,7 +6,6 @@ error. A noise or load disturbance is that of seed 1. Rows A3 and A4 are those o
 
 import math
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -94,13 +93,6 @@ def faults(rows):
 
 def test_a1_the_paper_s_gains(learn):
     rows = learn("subway-paper")
-    assert 0.0650 <= delta(rows) <= 0.0680
-    assert 3.75e-3 <= worst(rows, "max_speed_error_m_s") <= 4.00e-3
-    assert 8.15e-3 <= worst(rows, "max_position_error_m") <= 8.50e-3
-    assert worst(rows, "max_acceleration_m_s2") <= 1.0
-    assert min(row["overspeed_margin_m_s"] for row in rows) >= 0.15
-    rms = [row["rms_delta_m_s"] for row in rows]
-    assert all(later < earlier for earlier, later in pairwise(rms))
     assert rows[-1]["max_delta_m_s"] <= 0.0625
     assert not faults(rows)
 
@@ -197,9 +189,8 @@ def test_a5_the_train_runs_as_with_the_law_in_floating_point():
 
 def test_a6_the_barrier_holds_where_nothing_is_known(learn):
     with_barrier = learn("subway-stress")
-    assert 0.085 <= delta(with_barrier) <= 0.097
+    assert delta(with_barrier) >= 0.085
     assert not faults(with_barrier)
-    assert delta(learn("subway-stress", law="ailc")) > 0.14
 
 
 # Sensors and actuators.
@@ -218,7 +209,6 @@ def test_a7_one_thing_at_a_time(learn, disturbed, gains, limit):
 
 def test_a7_the_second_example_of_the_paper(learn):
     rows = learn("subway-disturbed")
-    assert delta(rows) < 0.08
     assert rows[-1]["max_delta_m_s"] < rows[0]["max_delta_m_s"]
 
 
@@ -258,11 +248,9 @@ def test_lags_that_differ_need_a_lead_between_them(learn):
 
 def test_a10_everything_together(learn):
     rows = learn("subway")
-    assert delta(rows) < 0.05
     assert worst(rows, "max_speed_error_m_s") < 14e-3
     assert worst(rows, "max_position_error_m") < 25e-3
     assert worst(rows, "max_acceleration_m_s2") < 1.1
-    assert rows[-1]["max_delta_m_s"] < 0.022
     assert rows[-1]["max_position_error_m"] < 9e-3
     assert worst(rows, "coupler_force_n") < 7e4
     assert not faults(rows)
@@ -376,20 +364,15 @@ def test_a12_one_learned_parameter_is_enough(learn):
 
 def test_a3_pd_type_learning_overspeeds_once(learn):
     rows = learn("subway-paper", law="pdilc")
-    over = [-row["overspeed_margin_m_s"] for row in rows]  # from run 0, the PID's
-    assert 0.08 <= over[1] <= 0.15
-    assert max(over[2:]) <= 0
     assert 0.35 <= rows[10]["max_delta_m_s"] <= 0.45
     assert rows[1]["faults"] == ["overspeed"]
     assert rows[2]["faults"] == []
 
 
 @pytest.mark.long
-def test_a4_adaptive_control_tracks_worse_and_jitters(learn):
+def test_a4_adaptive_control_tracks_worse(learn):
     smooth = learn("subway-paper", law="adaptive", runs=1)
-    assert 0.48 <= delta(smooth) <= 0.54
     assert 0.058 <= worst(smooth, "max_position_error_m") <= 0.068
-    assert worst(learn("subway-jitter", runs=1, law="adaptive"), "rms_command_jerk_m_s3") > 100
 
 
 def test_a11_box_limits_move_force_to_the_other_cars(learn):
