@@ -109,7 +109,7 @@ def damaged(folder: Path) -> list[Path]:
 
 
 def load(path: Path, key: Any) -> Any:
-    """What was saved under this key; None if nothing was, or it is damaged."""
+    """What was saved under this key; None if nothing was, or if it is damaged."""
     content = _content(path)
     if content is None:
         return None

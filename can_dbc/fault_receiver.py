@@ -56,8 +56,9 @@ from ato_hil.can_dbc.faults import (
 def receiver_of(
     folder: Path | None, node: str, train: int, planned: Sequence[Planned] = ()
 ) -> Receiver | None:
-    """The faults of a node that is a process, None without a folder; the plan is in the folder, and
-    there its log goes, line by line, so that it is whole whenever the process ends."""
+    """The faults of a node that runs as a process; None without a folder. The folder holds the
+    plan, and the node's log: it is written line by line, so that it is whole whenever the
+    process ends."""
     if folder is None:
         return None
     plan = msgspec.msgpack.decode((folder / PLAN_FILE).read_bytes(), type=Plan)

@@ -138,8 +138,9 @@ class Corrupt(Rule, frozen=True, kw_only=True, tag_field="kind", tag="corrupt"):
 
 
 class Masquerade(Rule, frozen=True, kw_only=True, tag_field="kind", tag="masquerade"):
-    """Instead of the frame comes one that another node made: random data, the right counter, and
-    CRC and nibble of the Data-ID of `source`, of any other message if there is none."""
+    """A frame that another node made comes in place of the frame: random data and the right
+    counter, with the CRC and Data-ID nibble of `source`, or of any other message where no
+    `source` is given."""
 
     source: str | None = None
 
@@ -149,8 +150,8 @@ class Masquerade(Rule, frozen=True, kw_only=True, tag_field="kind", tag="masquer
 
 
 class Insert(Rule, frozen=True, kw_only=True, tag_field="kind", tag="insert"):
-    """Another frame follows: random data under `id`, any standard identifier if there is none, with
-    CRC and nibble of `source` if that is given."""
+    """A further frame follows: random data under `id`, or under any standard identifier, with
+    the CRC and Data-ID nibble of `source` where that is given."""
 
     id: StandardId | str | None = None
     source: str | None = None
@@ -293,7 +294,8 @@ def table(path: Path, name: str, kind: Any) -> list[Any]:
 
 
 def save(plan: Plan, file: Path, folder: Path) -> None:
-    """The plan where `fault_receiver.receiver_of` looks for it, and the file that it is from."""
+    """Writes the plan where `fault_receiver.receiver_of` looks for it, and beside it the file
+    that it came from."""
     (folder / PLAN_FILE).write_bytes(msgspec.msgpack.encode(plan))
     (folder / SOURCE_FILE).write_bytes(file.read_bytes())
 
@@ -338,7 +340,8 @@ def _known(name: int | str | None) -> None:
 
 
 def identifiers(names: tuple[str, ...]) -> frozenset[int]:
-    """Identifiers of messages and of all messages of nodes; of all there are for none."""
+    """Identifiers of the messages, and of all messages of the nodes, that are named; those of
+    all messages if nothing is named."""
     if not names:
         return frozenset(BY_ID)
     found: set[int] = set()

@@ -317,7 +317,7 @@ def end_hung_hub(channel: str) -> None:
 
 
 def _kill_server(path: Path) -> None:
-    """Kill the hub that listens on a socket, where the system says who that is."""
+    """Kills the hub that listens on a socket, where the system can tell which process that is."""
     if not hasattr(socket, "SO_PEERCRED"):
         return
     with (

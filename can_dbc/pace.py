@@ -132,8 +132,8 @@ class Histogram:
             self.largest_us = max(self.largest_us, int(times_us.max()))
 
     def quantile(self, per_mille: int) -> int | None:
-        """The time, µs, that so many of a thousand times do not exceed, at most 1/32 too long;
-        None if there is none."""
+        """The time, µs, that so many of a thousand times do not exceed; at most 1/32 too long.
+        None without times."""
         reached = np.cumsum(self.counts)
         if reached[-1] == 0:
             return None

@@ -85,7 +85,7 @@ def _socket_directory(interface: str) -> Path:
 
 
 def join(server: Server, path: Path, ask: Callable[[Path], Answer]) -> Answer:
-    """What `ask` returns once it has reached a server, which is started if there is none.
+    """What `ask` returns once it has reached a server; one is started if there is none.
 
     :param ask: connects to the path; raises ConnectionError where the server hangs up.
     :raises can.CanInitializationError: there is no server and none can be started.

@@ -25,8 +25,8 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def strange_number(content: Any, key: str = "") -> Trouble | None:
-    """The first number of a file that is none to calculate with: not finite, or too large for 64
-    bits. None if all are."""
+    """The first number in the content of a file that cannot be calculated with, because it is
+    not finite or does not fit 64 bits; None if there is no such number."""
     if isinstance(content, dict):
         places: Iterable[tuple[str, Any]] = (
             (f"{key}.{name}" if key else str(name), value) for name, value in content.items()

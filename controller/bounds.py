@@ -472,7 +472,8 @@ class _Frame:
         return self._in_64_bits(node, result)
 
     def _number(self, node: ast.AST, value: Value) -> Int | None:
-        """The value as an integer; None, and a finding if there is none yet, if it is none."""
+        """The value as an integer; None if it is not one, with a finding unless there is one
+        already."""
         if isinstance(value, Int):
             return value
         if value is not UNKNOWN:
@@ -695,7 +696,7 @@ def _held(kind: np.dtype, path: str) -> Value:
 
 
 def _constant(held: Any, path: str) -> Value | None:
-    """An integer, table or array of the module as a value; None if it is none of these."""
+    """An integer, table or array of the module as a value; None for anything else."""
     if isinstance(held, bool | int | np.integer):
         return Int(int(held), int(held))
     if isinstance(held, tuple) and held:

@@ -264,8 +264,8 @@ def save(calibration: Calibration, path: Path) -> None:
 
 
 def load(path: Path) -> Calibration:
-    """Reads a calibration file. Raises CalibrationError if it is none or is for another build of
-    the law."""
+    """Reads a calibration file. Raises CalibrationError if the file is not one, or is for
+    another build of the law."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             head = json.loads(archive["head"].tobytes())

@@ -212,8 +212,9 @@ def state_dtype(law_state: np.dtype) -> np.dtype:
 def state_bounds(
     law: Mapping[str, tuple[int, int]], params: Any
 ) -> dict[str, Mapping[str, tuple[int, int]]]:
-    """Bounds that every tick keeps, by part of the state and field; a field without holds what its
-    type holds. `law` its STATE_BOUNDS, `params` one record of its `params_dtype`."""
+    """Bounds that every tick keeps, by part of the state and field; a field that is not listed
+    has those of its type. `law` is the law's STATE_BOUNDS, `params` one record of its
+    `params_dtype`."""
     cursor = reference.cursor_bounds(params["reference"])
     return {
         "core": CORE_BOUNDS,
@@ -230,7 +231,7 @@ def state_bounds(
 @step
 def begin(params: Record, profile: Array, state: Record, cells: Array, rate: Int) -> None:
     """State of a new run: reference at its start, counters at 0, no fault; the learning memory
-    stays. `rate` of its timetable, less 1, Q24."""
+    stays. `rate` is that of the timetable, less 1, Q24."""
     core = state.core
     reference.rewind(state.cursor, profile, rate)
     core.tick = 0
@@ -306,8 +307,8 @@ def position_now(params: Record, core: Record, speed: Int) -> Int:
 
 @step
 def read_inputs(params: Record, state: Record, rx: Array) -> None:
-    """Measurements, limit and tick from the mailboxes that pass their check; the others keep their
-    last value, but for the position, which goes on."""
+    """Measurements, limit and tick from the mailboxes that pass their check. The others keep
+    their last value; the position goes on by dead reckoning."""
     core = state.core
     inputs = state.inputs
     seen = state.seen
@@ -584,7 +585,7 @@ def command(params: Record, state: Record) -> None:
 
 @step
 def send(params: Record, state: Record, tx: Array) -> None:
-    """The frames of a tick of a run; FORCE_CMD is the last, who waits for it has them all."""
+    """The frames of a tick of a run. FORCE_CMD is the last: whoever has it has them all."""
     core = state.core
     tick = int64(core.tick)
     car_words(core, tx, int64(params.distribution.cars))

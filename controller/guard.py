@@ -324,8 +324,8 @@ def speed_ahead(params: Record, seen: Record, ticks: Int) -> Int:
 
 @step
 def is_too_fast_for_target(params: Record, seen: Record, ticks: Int) -> Int:
-    """1 if the speed in so many ticks needs more than the deceleration counted on to be the
-    target's where the target is; an old ATP_LIMIT looks further ahead."""
+    """1 if the speed in so many ticks is too much to be braked to the target's before the
+    target, with the deceleration that is counted on; an old ATP_LIMIT looks further ahead."""
     if int64(seen.target_distance) == NO_TARGET:
         return int64(0)
     ahead = ticks + int64(seen.limit_age)  # below 2^22

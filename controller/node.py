@@ -75,8 +75,8 @@ def callable_tick(tick: Any) -> Any:
 def build(
     calibration: Calibration, memory_file: Path | None = None, firmware: Path | None = None
 ) -> Controller:
-    """A controller; its learning memory comes from `memory_file` if that exists, its tick from the
-    library `firmware`, if one is given.
+    """A controller. Its learning memory comes from `memory_file` if that exists; its tick comes
+    from the library `firmware` if one is given.
 
     Raises store.MemoryFileError if the memory file is foreign or damaged, LibraryError if the
     library is.

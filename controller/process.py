@@ -206,8 +206,8 @@ def paced_answers(
 
 
 def ticks_ahead(controller: node.Controller, payload: int) -> int:
-    """How many ticks before that of a TRAIN_POSITION have not been computed; negative if it itself
-    has been."""
+    """How many ticks before that of a TRAIN_POSITION are still to be computed; negative if its
+    own tick has been."""
     core = controller.state[0]["core"]
     if int(core["run_state"]) != RUNNING:
         return 0

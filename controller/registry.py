@@ -28,7 +28,8 @@ PARTS = ("PARAMS", "STATE", "WORDS", "ESTIMATES", "Gains", "calibrate")  # of a 
 
 
 class LawError(InputError):
-    """There is no such law, or its file is none; one line that says what was expected."""
+    """There is no such law, or its file does not define one; one line that says what was
+    expected."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,8 @@ def is_file(name: str) -> bool:
 
 
 def law_label(name: str) -> str:
-    """What a law is called where its path says nothing: in gains tables, folders, memory files."""
+    """What a law is called where its path does not matter: in tables of gains, folders, memory
+    files."""
     return Path(name).stem.replace("_", "-") if is_file(name) else name
 
 
@@ -78,7 +80,8 @@ def has_defaults(name: str) -> bool:
 
 
 def load_law(name: str) -> Law:
-    """A law by name. Raises LawError if there is none of that name, or if its file is no law."""
+    """A law by name. Raises LawError if no law has that name, or if its file does not define
+    one."""
     if is_file(name):
         return law_of(_load_file(Path(name)))
     if name not in law_names():

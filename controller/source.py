@@ -190,7 +190,8 @@ def has_step(node: ast.FunctionDef) -> bool:
 
 
 def function_of(value: Any) -> Any:
-    """The Python function of what a name holds, compiled or not; None if it is none."""
+    """The Python function behind what a name holds, compiled or not; None if that is no
+    function."""
     function = getattr(value, "py_func", value)
     return function if inspect.isfunction(function) else None
 

@@ -332,7 +332,7 @@ def cheapest(
 ) -> NDArray[np.float64]:
     """v^2 of the run of least energy that takes `duration_s`, (n + 1,).
 
-    Raises Infeasible, with the least time, if there is none so fast.
+    Raises Infeasible, with the least time, if no run is so fast.
     """
     start = crawl(bounds, mesh)
     low, high, price = 0.0, np.inf, 1.0

@@ -387,8 +387,8 @@ def sense_train(params: Any, limits: Any, state: Any, chance: Any, tx: Any) -> N
 
 @step
 def read_train(params: Any, state: Any, rx: Any, truth: Any) -> None:
-    """Before a train model takes its command: the row of truth at the start of the tick, and the
-    command as what fails leaves it."""
+    """What comes before the train model's command: the row of truth at the start of the tick,
+    and the command as the failures leave it."""
     node = state.node
     train = state.train
     truth.position_m = train.position_m
@@ -406,7 +406,8 @@ def read_train(params: Any, state: Any, rx: Any, truth: Any) -> None:
 
 @step
 def act_train(params: Any, state: Any) -> None:
-    """After it has, before it moves: the actuators by a tick, and the safety brakes."""
+    """What comes between the train model's command and its motion: the actuators by a tick, and
+    the safety brakes."""
     failures.restore(state.failures, state.node)
     actuator.shift(state.actuator)
     order_brakes(params, state)

@@ -310,8 +310,8 @@ def listen(port: Port, heard: Heard, tick: int, timeout_s: float) -> None:
 
 
 def echoes(tick: int, frame_id: int, payload: int) -> bool:
-    """Whether a frame is the answer to a tick. A damaged one is: the plant then goes on without
-    it, and whoever judges the controller sees more of what it sends."""
+    """Whether a frame is the answer to a tick. A damaged frame counts: the plant goes on without
+    what it says, and whoever judges the controller sees more of what it sends."""
     return (
         frame_id == FORCE_CMD.frame_id
         and (payload >> TICK_START) & plant.TICK_MASK == tick & plant.TICK_MASK

@@ -192,8 +192,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class Loaded(msgspec.Struct, frozen=True):
-    """A scenario with what follows from it: of the line's first train, or as `member` gives it, of
-    another."""
+    """A scenario with what follows from it: that of the line's first train, or of another one
+    where `member` made it."""
 
     name: str  # with its case, as `load` takes it
     path: Path
@@ -611,7 +611,7 @@ def _wrong(error: msgspec.ValidationError) -> str:
 
 
 def _check(path: str, scenario: Scenario, under: str = "") -> None:
-    """What types cannot say; `under` is put before the keys of what the scenario became of."""
+    """Checks what types cannot say; `under` is put before each key that is named."""
     if scenario.law not in scenario.laws:
         raise ScenarioError(
             f"{path}: key {under}law: {scenario.law!r} has no gains,"

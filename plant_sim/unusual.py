@@ -1,4 +1,5 @@
-"""Values that are possible and that no train has: questioned once in a session, not refused."""
+"""Values that are possible but that no train has: each is questioned once in a session, not
+refused."""
 
 from __future__ import annotations
 

@@ -70,8 +70,8 @@ class World:
         return run_ticks(self.members[0], self.seed, run)
 
     def prepare(self, run: int) -> None:
-        """What a run has of its own before it is announced: its plant and sensors, where its trains
-        stand, its timetable, and the limit along that."""
+        """Sets what a run has of its own, before it is announced: its plant and sensors, where
+        its trains stand, its timetable, and the limit along that."""
         before = self.members[0].scenario
         self.members = [in_run(train, run) for train in self.planned]
         changed = self.members[0].scenario != before
@@ -192,8 +192,8 @@ def supervised(loaded: Loaded) -> atp.Limits:
 
 
 def limits_of(loaded: Loaded) -> np.ndarray:
-    """The limit over time, [n] of atp.LIMIT: as the plan states it, a row for each speed of the
-    reference, or none."""
+    """The limit over time, [n] of atp.LIMIT: as the plan states it, or a row for each speed of
+    the reference, or one row without a limit."""
     plan, period_s = loaded.scenario.profile, loaded.scenario.period_s
     if plan.limit_above_m_s is not None:
         speed_m_s = loaded.profile.speed_m_s

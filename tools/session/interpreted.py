@@ -29,7 +29,7 @@ from ato_hil.tools.session.makers import learned_by, sizes
 
 
 def main() -> int:
-    """Exit status 0. The input was checked by who starts this."""
+    """Exit status 0. Whoever starts this has checked the input."""
     parser = argparse.ArgumentParser(
         prog="python -m ato_hil.tools.session.interpreted", description=__doc__
     )

@@ -1,4 +1,4 @@
-"""Ctrl-C, and what ends a session alike, where it loses nothing.
+"""Ctrl-C, and the other signals that end a session, held back until they cost nothing.
 
 Python raises KeyboardInterrupt between any two lines: also when a run has been taken from its node
 and is in neither the summary nor the recording yet. While a session goes on it is therefore held
@@ -18,8 +18,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupts:
-    """Use as a context manager: within it, signals that would raise are only noted, in `came`. In a
-    thread that is not the main one there are none."""
+    """Use as a context manager: within it, signals that would raise are only noted, in `came`.
+    Signals come to the main thread; in any other this does nothing."""
 
     def __init__(self) -> None:
         self.came = False

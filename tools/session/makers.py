@@ -168,8 +168,8 @@ class Foreign(InProcess):
 
 
 class Interpreted(InProcess):
-    """The same of a child that interprets: what is chosen when the steps are imported cannot be
-    chosen again."""
+    """The same in a child that interprets the steps: a process chooses between compiled and
+    interpreted once, when it imports them."""
 
     def _next(self, made: Generator[Run, None, None]) -> Run | None:
         return next(made, None)  # the wait for the child lets them through

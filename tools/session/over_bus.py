@@ -121,8 +121,8 @@ class OverBus:
             self._refuse_incomplete_trace()
 
     def tell(self, run: Run) -> None:
-        """What is known of the run to the recorder's trace; the recorder has the frames, and knows
-        by itself what was injected."""
+        """Gives the recorder what is known of the run, for its trace. The recorder has the
+        frames itself, and knows what was injected."""
         if self.setup.options.trace and self._recorder is not None:
             file = self._kept / f"facts_{run.number}.npz"
             facts.save(replace(facts.of(run), injected=()), file)

@@ -121,8 +121,8 @@ class Target:
             raise RunError(self._ended()) from None
 
     def answer(self, kind: str) -> bytes:
-        """The content of the next block. Raises RunError if there is none, or it is of another
-        kind or damaged."""
+        """The content of the next block. Raises RunError if none comes, or if it is damaged or
+        of another kind."""
         head = self._read(4)
         if head[0] != START:
             raise RunError(f"{self.name} sends {head.hex()} where a block begins: no image of ours")

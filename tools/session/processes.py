@@ -422,7 +422,8 @@ def node_names(trains: int) -> list[str]:
 def _strike(
     bench: Bench, waiting: list[ProcessFault], event: dict[str, Any], log: Path | None
 ) -> list[ProcessFault]:
-    """Sends the signals whose time has come by what the plant tells of its progress; the others."""
+    """Sends the signals whose time has come, by what the plant tells of its progress; returns
+    those that are left."""
     if event["event"] != "progress":
         return waiting
     run, tick = event["run"], event["tick"]

@@ -80,7 +80,8 @@ class Account:
 
 
 def stolen_s() -> float:
-    """Processor time that the host of a virtual machine has taken so far; 0 where nobody says."""
+    """Processor time that the host of a virtual machine has taken so far; 0 where the system
+    does not say."""
     try:
         fields = Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0].split()
         return int(fields[8]) / os.sysconf("SC_CLK_TCK")  # proc_stat(5)

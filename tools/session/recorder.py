@@ -286,7 +286,7 @@ class Recorder:
 
 
 def dropped_frames(bus: can.BusABC) -> int:
-    """How many frames the bus has not been able to deliver to this node, where it counts them."""
+    """How many frames the bus could not deliver to this node, on a bus that counts them; else 0."""
     return int(getattr(bus, "frames_lost", 0))
 
 
