@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ato_hil.tools.cli import places
-from ato_hil.tools.cli.columns import COMPARED, SWEPT, cell, faults_of, headings
 from ato_hil.tools.cli.console import (
     EXIT_INTERRUPTED,
     fail,
@@ -19,7 +18,8 @@ from ato_hil.tools.cli.console import (
 )
 from ato_hil.tools.cli.options import LawName, Overwrite, Runs, ScenarioName, Seed
 from ato_hil.tools.cli.output import console
-from ato_hil.tools.cli.tables import Column, Row, show
+from ato_hil.tools.cli.tables import Column, Row, headings, show
+from ato_hil.tools.runs.columns import COMPARED, SWEPT, cell, faults_of
 
 if TYPE_CHECKING:
     from ato_hil.plant_sim.scenario import Loaded

@@ -137,7 +137,7 @@ def table(
 def figures(
     folders: Annotated[
         list[Path],
-        typer.Argument(metavar="DIR...", help="Folders of `ato-hil run`, all of one paper."),
+        typer.Argument(metavar="DIR...", help="Folders of `ato-hil run`, of one paper or of none."),
     ],
     out: Annotated[
         Path | None, typer.Option(help="Folder of the pictures; DIR/figures by default.")
@@ -147,7 +147,7 @@ def figures(
         typer.Option("--format", help="May be given several times; png and svg by default."),
     ] = None,
 ) -> None:
-    """Draw a paper's figures from runs, with what the paper states."""
+    """Draw a paper's figures from runs, with what the paper states; neutral ones of another law."""
     from ato_hil.tools.papers import draw
     from ato_hil.tools.runs.folder import read
 
@@ -160,7 +160,7 @@ def figures(
                 say(f"{drawn.stem}: not drawn: {drawn.why_not}")
                 continue
             files += draw.write(drawn, target, kinds)
-            say(f"{drawn.stem}: {drawn.drawing.caption}")
+            say(f"{drawn.stem}: {drawn.caption}")
     if not files:
         raise fail("nothing could be drawn", EXIT_BAD_INPUT)
     say(f"{len(files)} files in {target}")

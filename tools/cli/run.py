@@ -12,7 +12,6 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ato_hil.tools.cli import places
-from ato_hil.tools.cli.columns import cell, columns_of, faults_of, headings, shown_rows
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     EXIT_ENDED_EARLY,
@@ -40,7 +39,8 @@ from ato_hil.tools.cli.options import (
     Viewer,
 )
 from ato_hil.tools.cli.output import console
-from ato_hil.tools.cli.tables import Column, Row, show
+from ato_hil.tools.cli.tables import Column, Row, headings, show
+from ato_hil.tools.runs.columns import cell, columns_of, faults_of, shown_rows
 from ato_hil.tools.runs.expect import Expectation, check_keys, parse, unmet
 from ato_hil.tools.session import boards
 from ato_hil.tools.trace.live_viewer import LiveView

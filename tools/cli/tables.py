@@ -131,3 +131,8 @@ def _turned(
             console.print()
         console.print(table, crop=False)
         start += len(widths)
+
+
+def headings(columns: Sequence[tuple[str, str, float, str]]) -> list[Column]:
+    """The columns of a table; how fast the bench was is left out first."""
+    return [Column(name, spare=key == "ticks_per_s") for name, key, _factor, _text in columns]

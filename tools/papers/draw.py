@@ -10,7 +10,7 @@ import matplotlib
 from matplotlib.figure import Figure
 
 from ato_hil.tools import papers
-from ato_hil.tools.papers import style
+from ato_hil.tools.papers import neutral, style
 from ato_hil.tools.papers.style import Drawing
 from ato_hil.tools.runs.files import write_bytes
 from ato_hil.tools.runs.folder import Folder, FolderError, Missing
@@ -19,46 +19,56 @@ from ato_hil.tools.runs.folder import Folder, FolderError, Missing
 class Drawn(NamedTuple):
     """A figure, or why there is none."""
 
-    paper: str
+    paper: str  # "" for none
     drawing: Drawing
     figure: Figure | None
+    caption: str  # with the runs that are shown
     why_not: str = ""
 
     @property
     def stem(self) -> str:
-        """Of the file: cailc-fig6-speed-error."""
-        return f"{self.paper}-fig{self.drawing.number}-{self.drawing.slug}"
+        """Of the file: cailc-fig6-speed-error; that of no paper speed-error."""
+        slug = self.drawing.slug
+        return f"{self.paper}-fig{self.drawing.number}-{slug}" if self.paper else slug
 
 
 def paper_of(folder: Folder) -> str:
-    """The paper that the scenario of a folder stands for. Raises FolderError."""
+    """The paper that a folder's scenario stands for and its law belongs to; "" if there is none: a
+    paper's captions and numbers are not those of a law of one's own."""
     for paper in papers.names():
-        if folder.scenario.law in papers.part(paper).LAWS:
+        if {folder.scenario.law, folder.law} <= set(papers.part(paper).LAWS):
             return paper
-    raise FolderError(
-        f"{folder.path}: scenario {folder.name} with law {folder.scenario.law!r} belongs to none of"
-        f" the papers {', '.join(papers.names())}"
-    )
+    return ""
 
 
 def figures(folders: list[Folder]) -> Iterator[Drawn]:
-    """The figures of one paper, one after the other, from one or more folders.
+    """The figures of one paper, one after the other, from one or more folders; neutral ones where a
+    folder is of none.
 
     Raises FolderError if the folders belong to several papers, or a trace cannot be read.
     """
-    paper = paper_of(folders[0])
-    for folder in folders[1:]:
-        if paper_of(folder) != paper:
-            raise FolderError(
-                f"{folder.path} is of paper {paper_of(folder)}, {folders[0].path} of {paper}"
-            )
-    drawings: tuple[Drawing, ...] = papers.part(paper, "figures").FIGURES
+    of_folders = [paper_of(folder) for folder in folders]
+    paper = "" if "" in of_folders else of_folders[0]
+    for folder, other in zip(folders, of_folders, strict=True):
+        if paper and other != paper:
+            raise FolderError(f"{folder.path} is of paper {other}, {folders[0].path} of {paper}")
+    source = papers.part(paper, "figures") if paper else neutral
+    drawings: tuple[Drawing, ...] = source.FIGURES
     for drawing in drawings:
         with matplotlib.rc_context(style.settings()):
             try:
-                yield Drawn(paper, drawing, drawing.draw(folders))
+                figure = drawing.draw(folders)
+                yield Drawn(paper, drawing, figure, _caption(drawing, folders))
             except Missing as reason:
-                yield Drawn(paper, drawing, None, str(reason))
+                yield Drawn(paper, drawing, None, drawing.caption, str(reason))
+
+
+def _caption(drawing: Drawing, folders: list[Folder]) -> str:
+    if drawing.runs is None:
+        return drawing.caption
+    *others, last = (str(run) for run in dict.fromkeys(drawing.runs(folders)))
+    shown = f"runs {', '.join(others)} and {last}" if others else f"run {last}"
+    return f"{drawing.caption} in {shown}"
 
 
 def write(drawn: Drawn, out: Path, formats: Sequence[str]) -> list[Path]:

@@ -91,8 +91,9 @@ class Drawing(NamedTuple):
 
     number: int  # as the paper has it
     slug: str  # of the file
-    caption: str
+    caption: str  # without the runs
     draw: Callable[[list[Folder]], Figure]  # raises Missing
+    runs: Callable[[list[Folder]], list[int]] | None = None  # that it shows, if the caption says so
 
 
 def panels(rows: int = 1, columns: int = 1, height_in: float = 0.0) -> tuple[Figure, list[Axes]]:

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from ato_hil.tools.papers import draw, style
+from ato_hil.tools.runs.columns import LARGE, cell, columns_of, faults_of, shown_rows
 from ato_hil.tools.runs.files import write_text
 from ato_hil.tools.runs.folder import Folder, FolderError, read
 from ato_hil.tools.session import realtime
 from ato_hil.tools.trace.blueprints import title_of
 
-SESSION = ("scenario", "law", "mode", "pace", "bus", "external", "seed", "ended_early")
+SESSION = ("date", "scenario", "law", "mode", "pace", "bus", "external", "seed", "ended_early")
 DIGESTS = ("digest", "digests", "scenario_digest")
 ELSEWHERE = ("schema", "digest_repeats", "runs", "timing", "faults_file")
 SOURCES = ("versions", "machine", "configuration", "controller")
@@ -32,18 +33,18 @@ body { font: 15px/1.45 system-ui, sans-serif; color: #1b1b1b; max-width: 64rem;
 h1 { font-size: 1.5rem; margin-bottom: .2rem; }
 h2 { font-size: 1.1rem; margin-top: 2rem; border-bottom: 1px solid #ccc; }
 h3 { font-size: .95rem; margin-bottom: .3rem; }
-.wide { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .8rem; }
 th, td { padding: .2rem .55rem; text-align: right; border-bottom: 1px solid #e4e4e4;
   vertical-align: top; }
 th { font-weight: 600; }
-.wide td { white-space: nowrap; }
+td { overflow-wrap: break-word; }
 td:first-child, th:first-child, .plain td, .plain th { text-align: left; }
 .plain td { font-family: ui-monospace, monospace; overflow-wrap: anywhere; }
 figure { margin: 1rem 0; display: inline-block; vertical-align: top; }
 figure img { max-width: 100%; }
 figcaption { font-size: .8rem; color: #444; max-width: 28rem; }
-pre { background: #f6f6f6; padding: .7rem; overflow-x: auto; font-size: .8rem; }
+pre { background: #f6f6f6; padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere;
+  font-size: .8rem; }
 .bad { color: #a40000; font-weight: 600; }
 .quiet { color: #555; font-size: .8rem; }
 """
@@ -103,18 +104,40 @@ def _ended(summary: dict[str, Any]) -> str:
 
 
 def _runs(rows: list[dict[str, Any]]) -> str:
-    """A row for each run, and of a line or a service the trains or stops of the last one."""
+    """A row for each run and train, as the terminal has them; then every number of the first and
+    the last run, and of a line or a service the trains or stops of the last."""
     if not rows:
         return "<p>No run was completed.</p>"
-    parts = [_table([_plain(row) for row in rows])]
-    trains, stops = rows[-1].get("trains"), rows[-1].get("stops")
-    if trains:
-        parts.append(f"<h3>Trains of run {rows[-1]['run']}</h3>")
-        parts.append(_table([_plain(row) for row in trains]))
-    if stops:
-        parts.append(f"<h3>Stops of run {rows[-1]['run']}</h3>")
-        parts.append(_table(stops))
+    columns = [column for column in columns_of(rows[0]) if column[1] != "ticks_per_s"]
+    shown = [
+        {
+            **{
+                name.replace("\n", ", "): cell(each, key, f, text) for name, key, f, text in columns
+            },
+            "faults": faults_of(each) or "none",
+        }
+        for row in rows
+        for each in shown_rows(row)
+    ]
+    ends = {f"run {row['run']}": _plain(row) for row in (rows[0], rows[-1])}
+    parts = [_table(shown, title=str), f"<h3>Every number</h3>{_transposed(ends)}"]
+    if trains := rows[-1].get("trains"):
+        of_train = {f"train {each['train']}": _plain(each) for each in trains}
+        parts.append(f"<h3>Trains of run {rows[-1]['run']}</h3>{_transposed(of_train)}")
+    if stops := rows[-1].get("stops"):
+        parts.append(f"<h3>Stops of run {rows[-1]['run']}</h3>{_table(stops)}")
     return "\n".join(parts)
+
+
+def _transposed(columns: dict[str, dict[str, Any]]) -> str:
+    """A row a key, a column for each of the tables: as narrow as they are few."""
+    keys = dict.fromkeys(key for column in columns.values() for key in column)
+    rows = [
+        {"": title_of(key), **{name: column.get(key) for name, column in columns.items()}}
+        for key in keys
+        if key not in ("run", "train")
+    ]
+    return _table(rows, title=str)
 
 
 def _timing(timing: dict[str, Any] | None) -> str:
@@ -181,15 +204,15 @@ def _flat(value: dict[str, Any], stem: str = "") -> dict[str, Any]:
     return flat
 
 
-def _table(rows: Iterable[dict[str, Any]]) -> str:
-    """A row a row, a column a key."""
+def _table(rows: Iterable[dict[str, Any]], title: Callable[[str], str] = title_of) -> str:
+    """A row a row, a column a key; what heads a column is the key's title."""
     rows = list(rows)
     keys = list(dict.fromkeys(key for row in rows for key in row))
-    head = "".join(f"<th>{escape(title_of(key))}</th>" for key in keys)
+    head = "".join(f"<th>{escape(title(key))}</th>" for key in keys)
     body = "\n".join(
         f"<tr>{''.join(f'<td>{_cell(row.get(key))}</td>' for key in keys)}</tr>" for row in rows
     )
-    return f'<div class="wide"><table>\n<tr>{head}</tr>\n{body}\n</table></div>'
+    return f"<table>\n<tr>{head}</tr>\n{body}\n</table>"
 
 
 def _pairs(values: dict[str, Any]) -> str:
@@ -205,7 +228,7 @@ def _cell(value: Any, *, exact: bool = False) -> str:
     if value is None:
         return "-"
     if isinstance(value, float) and not exact:
-        return f"{value:.6g}"
+        return f"{value:,.0f}" if abs(value) >= LARGE else f"{value:.4g}"
     if isinstance(value, list):
         return escape(", ".join(map(str, value)) or "none")
     return escape(str(value))
@@ -215,13 +238,13 @@ def _figures(figures: Sequence[draw.Drawn]) -> str:
     parts = []
     missing = []
     for drawn in figures:
-        name = f"Fig. {drawn.drawing.number}"
+        name = f"Paper {drawn.paper}, Fig. {drawn.drawing.number}: " if drawn.paper else ""
         if drawn.figure is None:
-            missing.append(f"<li>{name}, {escape(drawn.drawing.caption)}: "
+            missing.append(f"<li>{name}{escape(drawn.caption)}: "
                            f"{escape(drawn.why_not)}</li>")  # fmt: skip
             continue
         picture = base64.b64encode(style.bytes_of(drawn.figure, "png", PICTURE_DPI)).decode()
-        caption = f"Paper {drawn.paper}, {name}: {drawn.drawing.caption}"
+        caption = f"{name}{drawn.caption}"
         parts.append(
             f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{picture}">'
             f"<figcaption>{escape(caption)}</figcaption></figure>"

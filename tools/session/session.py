@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,7 @@ class Session:
         self._injected: list[faults.Event] = []
         self.summary: dict[str, Any] = {
             "schema": SCHEMA,
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),  # when it began
             "scenario": loaded.name,
             "law": setup.law,
             "mode": options.mode,

@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 
 from ato_hil.plant_sim.scenario import load
-from ato_hil.tools.cli import buses, columns, run
+from ato_hil.tools.cli import buses, run
 from ato_hil.tools.cli.options import Mode
 from ato_hil.tools.cli.output import PlainConsole
-from ato_hil.tools.cli.tables import Column, Row, show
+from ato_hil.tools.cli.tables import Column, Row, headings, show
 from ato_hil.tools.reports.bus_report import Report
 from ato_hil.tools.reports.bus_report import report as bus_report
+from ato_hil.tools.runs import columns
 
 WIDTHS = (40, 80, 120)
 
@@ -79,7 +80,7 @@ def test_compare_and_sweep_cut_no_number(width: int, error_m: float) -> None:
                 )
             )
         ]
-        show(console, [Column(wide, text=True), *columns.headings(names)], rows)
+        show(console, [Column(wide, text=True), *headings(names)], rows)
         text = shown(console, width)
         assert "norm-optimal" in words(text)
         assert words(" ".join(rows[0].cells)) <= words(text) | {"1,234,568"}

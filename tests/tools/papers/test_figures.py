@@ -444,3 +444,24 @@ def test_one_run_of_each_paper(
         error = folder.series("truth/position_error_m", row["run"], train).line
         peak = np.abs(error[first : int(last)]).max()
         assert peak == pytest.approx(numbers["max_position_error_m"], rel=1e-9)
+
+
+def test_a_law_of_ones_own_gets_neutral_figures_that_name_their_runs(tmp_path: Path) -> None:
+    folders = []
+    for name, law in (("own", "./tracking.py"), ("cailc", "cailc")):
+        Recorded(tmp_path / name, "subway-paper", "cailc", 3, True)
+        file = tmp_path / name / "summary.json"
+        file.write_text(json.dumps({**json.loads(file.read_text()), "law": law}))
+        folders.append(read(tmp_path / name))
+    for shown in (folders[:1], folders):  # beside the paper's law, too
+        drawn = list(draw.figures(shown))
+        assert [each.stem for each in drawn] == [
+            *("speed", "errors", "acceleration", "position-error", "speed-error")
+        ]
+        assert all(each.figure is not None for each in drawn)
+        assert [each.caption for each in drawn][:2] == [
+            "Speed and its limit in run 3",
+            "Errors of position and speed in run 3",
+        ]
+    captions = {each.drawing.number: each.caption for each in draw.figures(folders[1:])}
+    assert captions[5] == "Position in run 3"

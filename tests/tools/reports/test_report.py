@@ -142,7 +142,7 @@ def test_its_pictures_are_inside_and_named(page) -> None:
         assert kind == "data:image/png;base64"
         assert base64.b64decode(content).startswith(b"\x89PNG")
         assert (picture["alt"] or "").startswith("Paper cailc, Fig. ")
-    assert "Speed in run 10: " in parsed.sections["Figures"], "says what is not there"
+    assert "Speed: " in parsed.sections["Figures"], "says what is not there"
     assert len(text) < 3e6
 
 
@@ -259,3 +259,18 @@ def test_a_saved_scenario_loads_as_a_file(tmp_path: Path) -> None:
     told = read(folder(tmp_path / "run", "gradient-paper:VI"))
     (tmp_path / "saved.toml").write_text(report.toml(told), encoding="utf-8")
     assert (load(str(tmp_path / "saved.toml")).segments == load("gradient-paper:VI").segments).all()
+
+
+def test_numbers_are_those_of_the_terminal_with_a_date_and_nothing_scrolls(tmp_path: Path) -> None:
+    numbers = {"max_position_error_m": 0.01234567, "stop_error_m": -12.3456789, "ticks": 1234567}
+    rows = [{"run": run, "faults": [], **numbers} for run in range(1, 31)]
+    parsed, text = text_of(folder(tmp_path, runs=rows, date="2026-02-03T04:05:06+00:00"))
+    runs = parsed.sections["Runs"]
+    assert "position error, mm" in runs
+    assert "12.346" in runs  # mm
+    assert "-12,346" in runs
+    assert "0.01235" in runs  # every number, m
+    assert "0.01234567" not in text.partition("Again")[0]
+    assert "2026-02-03T04:05:06+00:00" in parsed.sections["Session"]
+    assert "overflow-x" not in text
+    assert max(row.count("<td>") for row in text.split("<tr>")) <= 11

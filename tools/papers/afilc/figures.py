@@ -47,13 +47,19 @@ def run_lengths(folders: list[Folder]) -> Figure:
     return figure
 
 
+def runs_shown(folders: list[Folder]) -> list[int]:
+    """Which of the paper's runs there are. Raises Missing for none."""
+    completed = [row["run"] for row in folders[0].rows]
+    runs = [run for run in SHOWN if run in completed]
+    if not runs:
+        raise Missing(f"{folders[0].label} has none of the runs {', '.join(map(str, SHOWN))}")
+    return runs
+
+
 def resistance_in_runs(folders: list[Folder]) -> Figure:
     """The resistance that some runs met: that of the desired position, as far as they came."""
-    folder = folders[0]
+    folder, runs = folders[0], runs_shown(folders)
     of_run = {row["run"]: row for row in folder.rows}
-    runs = [run for run in SHOWN if run in of_run]
-    if not runs:
-        raise Missing(f"{folder.label} has none of the runs {', '.join(map(str, SHOWN))}")
     figure, axes = panels(len(runs), height_in=0.6 + 1.0 * len(runs))
     for index, (run, each) in enumerate(zip(runs, axes, strict=True)):
         place_m = desired_position(folder, of_run[run]["ticks"])
@@ -142,8 +148,8 @@ FIGURES = (
     Drawing(2, "run-length", "Length of each run", run_lengths),
     Drawing(3, "resistance", "Additional resistance along the track",
             plots.resistance_along_the_track("N/kg", N_PER_KG)),
-    Drawing(4, "resistance-in-runs", "Additional resistance in runs 4, 40 and 80",
-            resistance_in_runs),
+    Drawing(4, "resistance-in-runs", "Additional resistance",
+            resistance_in_runs, runs_shown),
     Drawing(5, "desired", "Desired speed and position", plots.desired),
     Drawing(6, "position-error", "Rms position error by run",
             errors_by_run("rms_position_error_m", 1.0, "rms position error [m]")),

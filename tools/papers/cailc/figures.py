@@ -49,6 +49,11 @@ def tenth_run(folders: list[Folder]) -> Figure:
     return _speed(folders, {folder.path: _late_run(folder) for folder in folders})
 
 
+def late_runs(folders: list[Folder]) -> list[int]:
+    """The run of each folder that the figures of run 10 show."""
+    return [_late_run(folder) for folder in folders]
+
+
 def _late_run(folder: Folder) -> int:
     """Run 10, or the last one before it. Raises Missing for a first run alone."""
     run = max(run for run in folder.learning_runs() if run <= TENTH)
@@ -198,15 +203,15 @@ FIGURES = (
     Drawing(2, "resistance", "Unit additional resistance of the track",
             plots.resistance_along_the_track("N/kN", 1.0)),
     Drawing(3, "speed-first-run", "Speed in the first learning run", first_run),
-    Drawing(4, "speed", "Speed in run 10", _disturbed(tenth_run, False)),
-    Drawing(5, "position", "Position in run 10", position),
+    Drawing(4, "speed", "Speed", _disturbed(tenth_run, False), late_runs),
+    Drawing(5, "position", "Position", position, late_runs),
     Drawing(6, "speed-error", "Largest speed error by run", _disturbed(speed_errors, False)),
     Drawing(7, "position-error", "Largest position error by run", position_errors),
     Drawing(8, "acceleration", "Acceleration and deceleration", _disturbed(acceleration, False)),
     Drawing(9, "motor-cars", "Traction and braking force of the motor cars", motor_cars),
     Drawing(10, "trailers", "Braking force of the trailers", trailers),
-    Drawing(11, "speed-disturbed", "Speed in run 10, with a load disturbance",
-            _disturbed(tenth_run, True)),
+    Drawing(11, "speed-disturbed", "Speed with a load disturbance",
+            _disturbed(tenth_run, True), late_runs),
     Drawing(12, "speed-error-disturbed", "Largest speed error by run, with a load disturbance",
             _disturbed(speed_errors, True)),
     Drawing(13, "acceleration-disturbed", "Acceleration and deceleration, with a load disturbance",

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
-
-from ato_hil.tools.cli.tables import Column
 
 # From here on a number needs no digits behind the point: 12 m, said in millimetres.
 LARGE = 10_000
@@ -87,7 +84,7 @@ def shown_rows(row: dict[str, Any]) -> list[dict[str, Any]]:
 
 def cell(row: dict[str, Any], key: str, factor: float, text: str) -> str:
     """A value of the row times `factor` in format `text`; "-" for none."""
-    value = row[key]
+    value = row.get(key)
     if value is None:
         return "-"
     if isinstance(value, int):
@@ -95,11 +92,6 @@ def cell(row: dict[str, Any], key: str, factor: float, text: str) -> str:
     scaled = value * factor
     shown = f"{scaled:,.0f}" if LARGE <= abs(scaled) < math.inf else text.format(scaled)
     return shown if shown.strip("-0.,") else shown.lstrip("-")  # no -0.0000
-
-
-def headings(columns: Sequence[tuple[str, str, float, str]]) -> list[Column]:
-    """The columns of a table; how fast the bench was is left out first."""
-    return [Column(name, spare=key == "ticks_per_s") for name, key, _factor, _text in columns]
 
 
 def faults_of(row: dict[str, Any]) -> str:
