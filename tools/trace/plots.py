@@ -26,6 +26,7 @@ from ato_hil.can_dbc.codec import (
     database,
 )
 from ato_hil.controller.interface import fault_names
+from ato_hil.plant_sim.plant import NO_TARGET_M
 from ato_hil.tools.runs.frames import physical
 from ato_hil.tools.trace.colours import (
     AHEAD,
@@ -173,6 +174,9 @@ SUPERVISION = {
 }
 
 
+NOTHING = -1e300  # in the place of a value that there is none of: a gap has corners of its own
+
+
 def corners(ticks: np.ndarray, values: np.ndarray, ramps: bool = True) -> np.ndarray:
     """Which rows to keep of values (rows, lines) at rising ticks: the first, the last, and those
     that a straight line between their neighbours does not give exactly.
@@ -181,6 +185,7 @@ def corners(ticks: np.ndarray, values: np.ndarray, ramps: bool = True) -> np.nda
         that whoever interpolates gets every value back to the last bit.
     """
     kept = np.ones(len(values), bool)
+    values = np.where(np.isnan(values), NOTHING, values)
     steps = np.diff(values, axis=0)
     straight = np.all(np.diff(steps, axis=0) == 0.0, axis=1) & (np.diff(ticks, 2) == 0)
     if not ramps:
@@ -213,7 +218,8 @@ def car_force_plot(cars: int) -> Plot:
 def table_of(
     plot: Plot, found: dict[str, tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ticks, and physical values (ticks, lines): NaN where a tick lacks the message.
+    """Ticks, and physical values (ticks, lines): NaN where a tick lacks the message, or where it
+    says that there is nothing, as no target of ATP's.
 
     Of several frames of one message in a tick, the last counts.
     """
@@ -225,7 +231,10 @@ def table_of(
     values = np.full((len(ticks), len(plot.lines)), np.nan)
     for column, line in enumerate(plot.lines):
         at, words = found[line.message.name]
-        values[np.searchsorted(ticks, at), column] = physical(words, line.message, line.signal)
+        shown = physical(words, line.message, line.signal).astype(np.float64)
+        if line.signal == "TargetDistance":
+            shown[shown >= NO_TARGET_M] = np.nan
+        values[np.searchsorted(ticks, at), column] = shown
     return ticks, values
 
 

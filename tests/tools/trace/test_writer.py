@@ -579,3 +579,16 @@ def test_the_time_for_a_frame_is_known_after_the_first(tmp_path: Path) -> None:
     writer.close()
     assert writer.us_per_frame is not None
     assert writer.us_per_frame > 0
+
+
+def test_no_target_is_a_gap_and_not_its_code():
+    from ato_hil.plant_sim.plant import NO_TARGET_M
+    from ato_hil.tools.trace.plots import PLOTS, corners, table_of
+
+    (plot,) = [each for each in PLOTS if each.name == "target_distance"]
+    metres = [NO_TARGET_M] * 4 + [500, 400, 300] + [NO_TARGET_M] * 3 + [0]
+    words = np.array([word(ATP_LIMIT, TargetDistance=value) for value in metres], np.int64)
+    ticks, values = table_of(plot, {"ATP_LIMIT": (np.arange(len(words)), words)})
+    assert np.isnan(values[:, 0]).tolist() == [value == NO_TARGET_M for value in metres]
+    kept = ticks[corners(ticks, values)].tolist()
+    assert kept == [0, 3, 4, 6, 7, 9, 10]  # both ends of a gap, so that no line crosses it
