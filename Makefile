@@ -19,7 +19,7 @@ DEV_READY := .venv/dev.ready
 COMPILE := .venv/bin/python -m uv pip compile pyproject.toml --universal --generate-hashes --group build \
 	--no-header --no-annotate --no-emit-index-url --quiet
 
-.PHONY: help hil test long test-socketcan pil verify prove firmware-page golden pareto figures pictures claims docs lint types lock clean
+.PHONY: help hil test long test-socketcan pil verify prove misra firmware-page golden pareto figures pictures claims docs lint types lock clean
 
 help: ## list the targets
 	sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 23
@@ -58,6 +58,10 @@ verify: $(RUN_READY) ## check every promise of the firmware: LAWS="cailc pid", a
 prove: $(RUN_READY) ## prove that no tick of the exported C overflows (Frama-C): LAWS="cailc pid", all by default
 	$(call install_tools,frama-c gcc,frama-c-base gcc)
 	.venv/bin/ato-hil verify --prove $(LAWS)
+
+misra: $(DEV_READY) ## check that MISRA.md of every law's export lists what cppcheck finds
+	$(call install_tools,cppcheck,cppcheck)
+	.venv/bin/python -m pytest -q -rs tests/tools/test_misra.py $(PYTEST_ARGS)
 
 firmware-page: $(RUN_READY) ## write docs/firmware.md again: flash, RAM, stack, instructions, coverage of the exported C
 	$(call install_tools,arm-none-eabi-gcc qemu-system-arm clang-19 llvm-cov-19,gcc-arm-none-eabi qemu-system-arm clang-19 llvm-19 libclang-rt-19-dev)

@@ -185,12 +185,22 @@ def bench(
         typer.Option(help="Bus to measure, may be repeated; the first is that of the HIL figure."),
     ] = None,
     sessions: Annotated[bool, typer.Option(help="Measure SIL and HIL too.")] = True,
+    parts: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SCENARIO",
+            help="Where the time of a control period in SIL goes, instead; may be repeated.",
+        ),
+    ] = None,
 ) -> None:
     """Measure SIL, HIL and buses as ratios to a peer in the same run."""
     from ato_hil.tools.bench import bench as rates
     from ato_hil.tools.bench import pingpong
 
     say("what is measured has the machine to itself: this takes minutes", "dim")
+    if parts:
+        _print_parts(parts)
+        return
     buses = bus or ["hub:bench"]
     with one_line_for_bad_input():
         if sessions:
@@ -210,6 +220,25 @@ def bench(
                 figures = pingpong.measure(name)
                 rows += [Row(_ping_pong(pair, figures[0])) for pair in figures]
         show(console, [Column("ping-pong", text=True), *map(Column, names)], rows)
+
+
+def _print_parts(scenarios: list[str]) -> None:
+    with one_line_for_bad_input():
+        from ato_hil.plant_sim.scenario import load
+        from ato_hil.tools.bench.parts import measure
+
+        for each in [load(scenario) for scenario in scenarios]:
+            with working(f"{each.name} ..."):
+                found = measure(each)
+            whole_ns = sum(found.parts.values())
+            rows = [
+                Row((part, f"{ns:,.0f}", f"{100 * ns / whole_ns:.0f}"))
+                for part, ns in found.parts.items()
+            ]
+            rows.append(Row(("all", f"{whole_ns:,.0f}", "100")))
+            rows.append(Row(("without marks", f"{found.period_ns:,.0f}", "")))
+            columns = [Column("part of a period", text=True), Column("ns"), Column("%")]
+            show(console, columns, rows, f"{found.scenario}, {found.law}")
 
 
 def _session(figure: Figure) -> tuple[str, ...]:
