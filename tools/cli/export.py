@@ -63,6 +63,7 @@ def image_command(
 class FmuBus(StrEnum):
     """How an FMU meets the others."""
 
+    can = "can"
     none = "none"
 
 
@@ -78,8 +79,9 @@ def fmu_command(
         bool, typer.Option("--plant", help="The plant instead: train, track, ATP and sensors.")
     ] = False,
     bus: Annotated[
-        FmuBus, typer.Option(help="none: signals of the frames are variables.")
-    ] = FmuBus.none,
+        FmuBus,
+        typer.Option(help="can: FMI-LS-BUS 1.0; none: signals of the frames are variables."),
+    ] = FmuBus.can,
 ) -> None:
     """The controller as an FMU (FMI 3.0 Co-Simulation) with its C and a binary, or the plant."""
     with one_line_for_bad_input():
@@ -88,6 +90,6 @@ def fmu_command(
         from ato_hil.tools.export.fmu import plant as plant_fmu
 
         part = plant_fmu if plant else controller
-        made = part.unpacked(load(scenario), law)
+        made = part.unpacked(load(scenario), law, bus.value)
         missing = archive.write(made, out)
     say(f"{out}: {len(made.interface.variables)} variables; {missing or 'with a binary'}")

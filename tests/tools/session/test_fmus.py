@@ -16,6 +16,8 @@ pytest.importorskip("fmpy")
 if shutil.which("cc") is None:
     pytest.skip("no C compiler is installed", allow_module_level=True)
 
+PARTS = ("controller", "plant")
+
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory, short_text):
@@ -29,6 +31,8 @@ def place(tmp_path_factory, short_text):
     loaded = load(str(folder / "short.toml"))
     archive.write(controller.unpacked(loaded, None), folder / "ato.fmu")
     archive.write(plant.unpacked(loaded, None), folder / "train.fmu")
+    archive.write(controller.unpacked(loaded, None, "none"), folder / "plain-ato.fmu")
+    archive.write(plant.unpacked(loaded, None, "none"), folder / "plain-train.fmu")
     return folder
 
 
@@ -48,10 +52,10 @@ def made(place, tmp_path, silent):
 @pytest.mark.parametrize(
     ("parts", "runs"),
     [
-        (("controller", "plant"), 1),
+        (PARTS, 1),
         *(
             pytest.param(parts, 2, marks=pytest.mark.long)
-            for parts in (("controller",), ("plant",), ("controller", "plant"))
+            for parts in (("controller",), ("plant",), PARTS)
         ),
     ],
 )
@@ -64,6 +68,13 @@ def test_fmus_in_every_place_give_the_digest_of_sil(place, made, parts, runs):
     for ours, theirs in zip(expected["runs"], summary["runs"], strict=True):
         del ours["ticks_per_s"], theirs["ticks_per_s"]
         assert ours == theirs
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("names", [("ato", "plain-train"), ("plain-ato", "plain-train")])
+def test_fmus_with_and_without_a_bus_meet(place, made, names):
+    files = {f"{part}_fmu": place / f"{n}.fmu" for part, n in zip(PARTS, names, strict=True)}
+    assert made(runs=1, **files)["digest"] == made("sil", runs=1)["digest"]
 
 
 @pytest.mark.long

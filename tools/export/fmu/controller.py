@@ -10,14 +10,14 @@ from ato_hil.controller.registry import law_label
 from ato_hil.plant_sim.scenario import Loaded, members
 from ato_hil.tools.export import firmware
 from ato_hil.tools.export.firmware import Firmware, Translated
-from ato_hil.tools.export.fmu import sources, variables
+from ato_hil.tools.export.fmu import can, sources, variables
 from ato_hil.tools.export.fmu.archive import Unpacked
 from ato_hil.tools.export.fmu.description import About
 from ato_hil.tools.export.fmu.variables import Interface, Variable
 from ato_hil.tools.runs import onboard
 
 
-def unpacked(loaded: Loaded, law: str | None) -> Unpacked:
+def unpacked(loaded: Loaded, law: str | None, bus: str = "can") -> Unpacked:
     """The controller of a scenario. Raises ExportError, or what loading the law raises."""
     law = law or loaded.scenario.law
     firmware.refuse(law)
@@ -27,7 +27,7 @@ def unpacked(loaded: Loaded, law: str | None) -> Unpacked:
         title=f"ATO {law_label(law)}, {loaded.name}",
         text=f"Automatic train operation: law {law_label(law)}, scenario {loaded.name}",
         version=importlib.metadata.version("ato-hil"),
-        content=f"scenario {loaded.digest}, sources {library.source_digest(law)}",
+        content=f"scenario {loaded.digest}, sources {library.source_digest(law)}, bus {bus}",
         period_s=loaded.scenario.period_s,
         stop_s=round((loaded.ticks + 2) * loaded.scenario.period_s, 9),
     )
@@ -43,7 +43,10 @@ def unpacked(loaded: Loaded, law: str | None) -> Unpacked:
         )
         macros["FMU_TRAIN"] = "train"
     received, sent = onboard.frames(loaded)
-    variables.add_plain(interface, received, sent)
+    if bus == "can":
+        macros |= can.add(interface, received, sent)
+    else:
+        variables.add_plain(interface, received, sent)
     return Unpacked(about, interface, _files(made, about, interface, macros))
 
 

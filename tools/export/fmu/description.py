@@ -156,7 +156,7 @@ def _structure(root: Element, variables: Sequence[Variable]) -> None:
     for reference, _variable in outputs:
         SubElement(structure, "Output", valueReference=str(reference), dependencies="")
     for reference, variable in outputs:
-        if variable.kind != "Clock" and not variable.clock:
+        if not variable.clock:
             SubElement(structure, "InitialUnknown", valueReference=str(reference), dependencies="")
 
 

@@ -19,7 +19,7 @@ from ato_hil.plant_sim import plant, track, world
 from ato_hil.plant_sim.scenario import MODELS, RUNS_MAX, Loaded, ScenarioError, Start
 from ato_hil.tools.export import closed_loop, firmware
 from ato_hil.tools.export.closed_loop import LIMITS, REAL
-from ato_hil.tools.export.fmu import sources, variables
+from ato_hil.tools.export.fmu import can, sources, variables
 from ato_hil.tools.export.fmu.archive import Unpacked
 from ato_hil.tools.export.fmu.description import About
 from ato_hil.tools.export.fmu.variables import Interface, Variable
@@ -44,7 +44,7 @@ EXACT = """#if defined(__clang__)
 """
 
 
-def unpacked(loaded: Loaded, law: str | None) -> Unpacked:
+def unpacked(loaded: Loaded, law: str | None, bus: str = "can") -> Unpacked:
     """The plant of a scenario; the law settles the numbers of its runs. Raises ScenarioError for a
     scenario whose runs are not alike."""
     _refuse(loaded)
@@ -54,7 +54,7 @@ def unpacked(loaded: Loaded, law: str | None) -> Unpacked:
         title=f"Train, {loaded.name}",
         text=f"Train, track, ATP and sensors of scenario {loaded.name}",
         version=importlib.metadata.version("ato-hil"),
-        content=f"scenario {loaded.digest}, sources {_source_digest()}",
+        content=f"scenario {loaded.digest}, sources {_source_digest()}, bus {bus}",
         period_s=loaded.scenario.period_s,
         stop_s=round(len(runs) * (loaded.ticks + 2) * loaded.scenario.period_s, 9),
     )
@@ -74,7 +74,10 @@ def unpacked(loaded: Loaded, law: str | None) -> Unpacked:
     )
     macros = {f"FMU_{name.upper()}": name for name in ("seed", "first_run", "last_run")}
     to_controller, from_controller = onboard.frames(loaded)
-    variables.add_plain(interface, from_controller, to_controller)
+    if bus == "can":
+        macros |= can.add(interface, from_controller, to_controller)
+    else:
+        variables.add_plain(interface, from_controller, to_controller)
     for name in plant.TRUTH.names or ():
         what, unit = split(name)
         text = f"Truth of the last control period: {what.replace('_', ' ')}"

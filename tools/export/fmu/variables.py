@@ -120,6 +120,18 @@ def add_plain(made: Interface, received: Sequence[str], sent: Sequence[str]) -> 
         made.frames.append(Frame(message, False, f"{name}.fresh", f"{name}.payload", signals))
 
 
+def add_unseen(made: Interface, received: Sequence[str]) -> None:
+    """Frames that come by the bus alone."""
+    made.frames += [Frame(message, True, "", "", []) for message in _messages(received)]
+
+
+def add_sent(made: Interface, sent: Sequence[str]) -> None:
+    """The signals of frames that go by the bus, as outputs to look at."""
+    for message in _messages(sent):
+        signals = [(p, v.name, mux) for p, v, mux in _signals(made, message, "output")]
+        made.frames.append(Frame(message, False, "", "", signals))
+
+
 PAYLOAD = "Last such frame: its eight bytes as a number, the first byte lowest"
 
 

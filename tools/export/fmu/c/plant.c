@@ -179,6 +179,9 @@ void fmu_model_period(fmu_state *state)
     default:
         break;
     }
+    for (int32_t i = 0; i < FMU_MESSAGES; i++) {
+        own->rx[i].fresh = 0;
+    }
 }
 
 #if FMU_CAN
