@@ -30,6 +30,14 @@ BARS = (
     "rms_speed_error_m_s",
 )
 
+# Of ATP's curves, beside the permitted speed; colours as in `plots.SUPERVISION`.
+CURVES = {
+    "warning_speed_m_s": "warning yellow",
+    "service_brake_speed_m_s": "SBI pink",
+    "emergency_brake_speed_m_s": "EBI violet",
+    "emergency_deceleration_speed_m_s": "EBD grey",
+}
+
 RUNS = "violet is the first run, yellow the last"
 TRAINS = "violet is the leading train, yellow the last"
 
@@ -201,6 +209,8 @@ def _overview(layout: Layout) -> rrb.Container:
     import rerun.blueprint as rrb
 
     current, reference = layout.current, _reference(layout)
+    curves = [field for field in CURVES if field in layout.fields]
+    supervised = "".join(f", {CURVES[field]}" for field in curves)
     forces = (
         plot("Force by car [N]", f"bus/car_force/{current}")
         if layout.car_forces
@@ -209,17 +219,20 @@ def _overview(layout: Layout) -> rrb.Container:
     return rrb.Horizontal(
         rrb.Vertical(
             plot(
-                "Speed: measured blue, reference orange, permitted red, target pink [m/s]",
+                "Speed: measured blue, reference orange, permitted red"
+                f"{supervised or ', target pink'} [m/s]",
                 f"bus/motion/{current}",
                 f"reference/speed_m_s{reference}",
                 f"truth/{LIMITS}/{current}",
                 legend=False,
                 # The permitted speed is on the bus already.
-                shown=_motion(layout, "Speed", "TargetSpeed", "PermittedSpeed")
-                | _true(layout, LIMITS, *list(SUPERVISION)[1:]),
+                shown=_motion(
+                    layout, "Speed", "PermittedSpeed", *(() if curves else ("TargetSpeed",))
+                )
+                | _true(layout, LIMITS, *CURVES),
             ),
             chart(
-                "Speed over position: true green, reference orange, permitted red [m/s, m]",
+                f"Over position: true green, reference orange, permitted red{supervised} [m/s, m]",
                 "over_position/speed",
                 layout.length_m,
             ),

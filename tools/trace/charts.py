@@ -37,13 +37,14 @@ def curves(lines: Iterable[Curve], y_unit: str) -> dict[str, rr.AsComponents]:
     """Lines over position (m), which begins at 0, with axes around them: what to log, by entity.
     The last line is on top.
 
-    Both coordinates are not negative; samples that are not finite are left out.
+    Both coordinates are not negative; no line crosses samples that are not finite.
     """
     import rerun as rr
 
-    shown = [_finite(line) for line in lines]
-    width = max((float(line.x.max()) for line in shown if len(line.x)), default=1.0) or 1.0
-    height = max((float(line.y.max()) for line in shown if len(line.y)), default=1.0) or 1.0
+    shown = [(line, _pieces(line)) for line in lines]
+    every = [piece for _line, pieces in shown for piece in pieces]
+    width = max((float(x.max()) for x, _y in every), default=1.0) or 1.0
+    height = max((float(y.max()) for _x, y in every), default=1.0) or 1.0
     scale = width / (SHAPE * height)
     drawing: dict[str, rr.AsComponents] = {
         "grid": rr.LineStrips2D(
@@ -61,9 +62,9 @@ def curves(lines: Iterable[Curve], y_unit: str) -> dict[str, rr.AsComponents]:
             [f"{value:g} {y_unit}" for value in ticks(height)[1:]],
         ),
     }
-    for above, line in enumerate(shown):
+    for above, (line, pieces) in enumerate(shown):
         drawing[line.name] = rr.LineStrips2D(
-            [np.column_stack((line.x, -line.y * scale))],
+            [np.column_stack((x, -y * scale)) for x, y in pieces],
             colors=[line.colour],
             radii=rr.Radius.ui_points(line.width / 2),
             draw_order=20.0 + above,
@@ -130,12 +131,14 @@ def _distances(values_m: list[float]) -> list[str]:
     return [f"{value:g} m" for value in values_m]
 
 
-def _finite(line: Curve) -> Curve:
-    """Few enough points, and only those that are numbers."""
+def _pieces(line: Curve) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The line without its gaps, x and y of each piece; few enough points."""
     usable = np.isfinite(line.x) & np.isfinite(line.y)
-    x, y = line.x[usable], line.y[usable]
-    kept = np.unique(np.linspace(0, len(x) - 1, min(len(x), POINTS_MAX)).astype(np.int64))
-    return line._replace(x=x[kept], y=y[kept])
+    places = np.flatnonzero(usable)
+    pieces = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)
+    every = math.ceil(len(places) / max(POINTS_MAX - len(pieces), 1)) or 1
+    few = [np.unique(np.append(piece[::every], piece[-1:])) for piece in pieces if len(piece)]
+    return [(line.x[piece], line.y[piece]) for piece in few]
 
 
 def _labels(

@@ -143,7 +143,10 @@ def _add(stream: Any, recorded: Recorded, colour: Colour, first: bool) -> None:
     import rerun as rr
 
     last = recorded.runs[-1]["run"]
-    style = rr.SeriesLines(names=[recorded.label], colors=[colour], widths=[1.5])
+    as_it_is = rr.components.AggregationPolicy.Off  # as the session's own trace has it
+    style = rr.SeriesLines(
+        names=[recorded.label], colors=[colour], widths=[1.5], aggregation_policy=as_it_is
+    )
     names = {  # of the lines of an entity
         chunk.entity_path: chunk.to_record_batch().column("SeriesLines:names").to_pylist()[0]
         for chunk in _chunks(recorded, static=True)
@@ -169,7 +172,12 @@ def _add(stream: Any, recorded: Recorded, colour: Colour, first: bool) -> None:
                 stream.send_chunks([chunk.with_entity_path(f"/{entity}")])
             case ["reference", "speed_m_s"] if first:
                 entity = "speed_m_s/reference"
-                orange = rr.SeriesLines(names=["reference"], colors=[REFERENCE], widths=[1.5])
+                orange = rr.SeriesLines(
+                    names=["reference"],
+                    colors=[REFERENCE],
+                    widths=[1.5],
+                    aggregation_policy=as_it_is,
+                )
                 stream.log(entity, orange, static=True, strict=True)
                 stream.send_chunks([chunk.with_entity_path(f"/{entity}")])
 
