@@ -19,7 +19,7 @@ DEV_READY := .venv/dev.ready
 COMPILE := .venv/bin/python -m uv pip compile pyproject.toml --universal --generate-hashes --group build \
 	--no-header --no-annotate --no-emit-index-url --quiet
 
-.PHONY: help hil test long test-socketcan pil verify prove misra firmware-page golden pareto figures pictures claims docs lint types lock clean
+.PHONY: help hil test long test-socketcan pil verify prove misra firmware-page yizhuang golden pareto figures pictures claims docs lint types lock clean
 
 help: ## list the targets
 	sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 23
@@ -66,6 +66,9 @@ misra: $(DEV_READY) ## check that MISRA.md of every law's export lists what cppc
 firmware-page: $(RUN_READY) ## write docs/firmware.md again: flash, RAM, stack, instructions, coverage of the exported C
 	$(call install_tools,arm-none-eabi-gcc qemu-system-arm clang-19 llvm-cov-19,gcc-arm-none-eabi qemu-system-arm clang-19 llvm-19 libclang-rt-19-dev)
 	.venv/bin/python -m ato_hil.tools.verify.microcontroller $(LAWS)
+
+yizhuang: $(RUN_READY) ## run the service of docs/yizhuang.md again and write what was measured there
+	.venv/bin/python -m ato_hil.tools.reports.service
 
 golden: $(RUN_READY) ## write new golden digests (tools/verify/golden.json) and say what changed
 	.venv/bin/ato-hil verify --renew-golden $(LAWS)

@@ -33,7 +33,9 @@ def write(tmp_path):
 def test_a_packaged_scenario_loads(name):
     loaded = load(name)
     assert loaded.name == name
-    assert loaded.ticks == round(loaded.scenario.profile.duration_s / loaded.scenario.period_s) + 1
+    plan = loaded.scenario.profile
+    stops_s = sum((stop.run_s or 0.0) + stop.dwell_s for stop in plan.stops)
+    assert loaded.ticks == round((plan.duration_s or stops_s) / loaded.scenario.period_s) + 1
     assert loaded.scenario.title
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ato_hil.tools.papers import draw, style
+from ato_hil.tools.reports import service
 from ato_hil.tools.runs.columns import LARGE, cell, columns_of, faults_of, shown_rows
 from ato_hil.tools.runs.files import write_text
 from ato_hil.tools.runs.folder import Folder, FolderError, read
@@ -73,6 +74,7 @@ def html(folder: Folder, figures: Sequence[draw.Drawn]) -> str:
         _section("Runs", _runs(folder.rows)),
         _section("Timing", _timing(summary.get("timing"))),
         *_others(folder.rows, summary),
+        _section("Service", _service(folder)),
         _section("Figures", _figures(figures)),
         _section("Again", _again(folder)),
         _section("Gains", _gains(folder)),
@@ -252,6 +254,23 @@ def _figures(figures: Sequence[draw.Drawn]) -> str:
     if missing:
         parts.append(f'<div class="quiet">Not from this folder:<ul>{"".join(missing)}</ul></div>')
     return "\n".join(parts)
+
+
+def _service(folder: Folder) -> str:
+    """The picture of a service, of the last run that the trace has."""
+    rows = [row for row in folder.rows if row.get("stops")]
+    if not rows or not folder.loaded.calls:
+        return ""
+    whole = [run for run in folder if not run.missing]
+    if not whole:
+        return ""
+    drawn = service.figure(folder.loaded, whole[-1].truths[0], rows)
+    picture = base64.b64encode(style.bytes_of(drawn, "png", PICTURE_DPI)).decode()
+    caption = f"The service of run {whole[-1].number}; arrivals and stop errors of all runs"
+    return (
+        f'<figure><img alt="{caption}" src="data:image/png;base64,{picture}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
 
 
 def _again(folder: Folder) -> str:
