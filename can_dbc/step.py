@@ -31,6 +31,7 @@ from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 
 from ato_hil.can_dbc import cache as cache_files
+from ato_hil.can_dbc.errors import InputError
 
 INTERPRETED = os.environ.get("ATO_HIL_INTERPRETED") == "1"
 # Each package and what it may import: a step compiles these sources in.
@@ -55,7 +56,7 @@ _INT64_MIN = -(2**63)
 _INT64_MAX = 2**63 - 1
 
 
-class StepError(ValueError):
+class StepError(InputError):
     """A step cannot be compiled here; one line."""
 
 
@@ -228,8 +229,8 @@ def require_compiler() -> None:
     """Raises StepError where steps are neither compiled nor interpreted."""
     if numba.config.DISABLE_JIT and not INTERPRETED:
         raise StepError(
-            "NUMBA_DISABLE_JIT is set, and the steps need the compiler: unset it, or take"
-            " --mode mil, which interprets them"
+            "NUMBA_DISABLE_JIT is set, and the steps need the compiler: unset it, or run"
+            " with --mode mil, which interprets them"
         )
 
 

@@ -9,6 +9,7 @@ import typer
 
 from ato_hil.tools.cli import places
 from ato_hil.tools.cli.console import (
+    EXIT_ENDED_EARLY,
     EXIT_INTERRUPTED,
     fail,
     one_line_for_bad_input,
@@ -46,6 +47,7 @@ def compare(
         from ato_hil.plant_sim.scenario import load
         from ato_hil.tools.campaigns import compare as side_by_side
         from ato_hil.tools.runs import files, locks
+        from ato_hil.tools.trace.writer import TraceError
 
         loaded = load(scenario)
         names = [law.strip() for law in laws.split(",") if law.strip()]
@@ -55,14 +57,17 @@ def compare(
             locks.folder_held(place.work),
             working("compiling, where it is the first time") as update,
         ):
-            rows = side_by_side.compare(
-                loaded,
-                names,
-                runs or loaded.scenario.runs,
-                seed,
-                place.work / "trace.rrd",
-                lambda law: update(f"{law} ..."),
-            )
+            try:
+                rows = side_by_side.compare(
+                    loaded,
+                    names,
+                    runs or loaded.scenario.runs,
+                    seed,
+                    place.work / "trace.rrd",
+                    lambda law: update(f"{law} ..."),
+                )
+            except TraceError as error:
+                raise fail(str(error), EXIT_ENDED_EARLY) from None
             content = {"schema": 1, "scenario": loaded.name, "rows": rows}
             files.write_json(place.work / "compare.json", content)
     columns = [Column("law", text=True), *headings(COMPARED), Column("faults", text=True)]

@@ -57,7 +57,7 @@ EXIT_STATUS = f"""Exit status:
 | 0 | done, and everything that was checked is right |
 | {EXIT_BAD_INPUT} | bad input, on one line that says what was expected; or a check failed |
 | 2 | a command, option or value that the command line does not have |
-| {EXIT_ENDED_EARLY} | a run ended early: a node or the bus is gone; the runs before it are kept |
+| {EXIT_ENDED_EARLY} | ended early: a node or bus is gone, a disk full; what was finished is kept |
 | {EXIT_NOT_AS_EXPECTED} | `run --expect`: the last run is otherwise |
 | {EXIT_NOT_CONTROLLED} | `run`: a train was without a command for so long that its vehicle \
 braked (fault `not_controlled`), and no `--faults` had asked for that |

@@ -11,6 +11,7 @@ the session began with a learning memory.
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import os
 import queue
@@ -58,7 +59,7 @@ SCHEMA = 1
 
 
 class RecordError(InputError):
-    """A recording cannot be written or read; one line that names the file."""
+    """No recording can be written there, or it cannot be read; one line that names the file."""
 
 
 class Origin(msgspec.Struct, frozen=True, kw_only=True):
@@ -153,7 +154,7 @@ def save_origin(
     memory_file: Path | None,
 ) -> None:
     """Write FILE.json, and FILE.memory if `memory_file` exists; `scenario` as in Origin. Raises
-    RecordError."""
+    OSError."""
     copy = beside(path, "memory")
     origin = Origin(
         schema=SCHEMA,
@@ -164,13 +165,10 @@ def save_origin(
         seed=seed,
         memory=copy.name if memory_file is not None and memory_file.exists() else None,
     )
-    try:
-        copy.unlink(missing_ok=True)
-        if memory_file is not None and origin.memory is not None:
-            shutil.copyfile(memory_file, copy)
-        _save(path, origin)
-    except OSError as error:
-        raise RecordError(f"{error.filename}: cannot be written: {error.strerror}") from None
+    copy.unlink(missing_ok=True)
+    if memory_file is not None and origin.memory is not None:
+        shutil.copyfile(memory_file, copy)
+    _save(path, origin)
 
 
 def _save(path: Path, origin: Origin) -> None:
@@ -188,17 +186,14 @@ class Recording:
     """
 
     def __init__(self, path: Path, period_s: float, backlog_runs: int = 0) -> None:
-        """Create the file. Raises RecordError.
+        """Create the file. Raises OSError.
 
         :param period_s: of a tick.
         :param backlog_runs: how many runs may wait to be written before `add` waits.
         """
         self._path = path
         self._period_s = period_s
-        try:
-            self._writer = _writer_of(path)
-        except OSError as error:
-            raise RecordError(f"{path}: cannot be written: {error.strerror}") from None
+        self._writer = _writer_of(path)
         self._start_tick = 0  # of the next run
         self._frames = 0
         self._last_run = -1
@@ -215,7 +210,7 @@ class Recording:
     def add(self, run: int, frames: np.ndarray) -> None:
         """Have the FRAME rows of a run written; a run that was added before is not added again.
 
-        Waits while too many runs are still to be written. Raises RecordError.
+        Waits while too many runs are still to be written. Raises OSError.
         """
         self._runs.put((run, frames))
         self._room.acquire()
@@ -247,9 +242,14 @@ class Recording:
             self._raise_error()
 
     def _raise_error(self) -> None:
-        if self._error is not None:
-            reason = getattr(self._error, "strerror", None) or self._error
-            raise RecordError(f"{self._path}: cannot be written: {reason}") from None
+        """Raises OSError, of the writer or for whatever else it raised; it names the file."""
+        error = self._error
+        if error is not None:
+            code, reason = errno.EIO, str(error)
+            if isinstance(error, OSError):
+                code, reason = error.errno or code, error.strerror or reason
+            text = f"cannot be written: {reason}"
+            raise OSError(code, text, str(self._path)) from None
 
     def _write_meekly(self) -> None:
         if sys.platform == "linux":  # where it is that of one thread: the nodes come first

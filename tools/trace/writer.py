@@ -31,6 +31,7 @@ straight line between its neighbours is left out, since a plot draws that line a
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import time
@@ -156,6 +157,7 @@ class TraceWriter:
         :raises TraceError: the file cannot be written, or `cars` is out of range.
         """
         os.environ.pop("RERUN", None)  # of other programs: "0" would leave us without a trace
+        os.environ.setdefault("RUST_LOG", "off")  # what it would log is what `close` raises
         import rerun as rr  # costs a second and 100 MB: only who writes a trace pays for it
 
         if not 0 <= cars <= MAX_CARS:
@@ -405,7 +407,9 @@ class TraceWriter:
         try:
             self._file.flush()
         except RuntimeError as error:
-            raise TraceError(f"{self._path}: the trace is incomplete: {error}") from None
+            full = os.statvfs(self._path.parent).f_bavail == 0
+            reason = os.strerror(errno.ENOSPC) if full else error
+            raise TraceError(f"{self._path}: the trace is incomplete: {reason}") from None
         finally:
             self._file.disconnect()
             self._streams.remove(self._file)

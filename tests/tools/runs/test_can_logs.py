@@ -181,7 +181,7 @@ def test_a_full_disk_is_said(tmp_path: Path) -> None:
             for run in range(3):
                 recording.add(run, np.zeros(5000, FRAME))
 
-    with pytest.raises(RecordError, match=r"full.log: cannot be written: No space left"):
+    with pytest.raises(OSError, match=r"cannot be written: No space left"):
         session()
 
 
@@ -194,7 +194,7 @@ def test_whatever_a_writer_raises_is_said(tmp_path: Path, monkeypatch) -> None:
             recording.add(1, frames((0, 1, 1)))
 
     monkeypatch.setattr(can_logs, "write_frames", broken)
-    with pytest.raises(RecordError, match=r"x.log: cannot be written: this is why"):
+    with pytest.raises(OSError, match=r"cannot be written: this is why: .*x.log"):
         session()
 
 
