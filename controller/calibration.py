@@ -87,6 +87,7 @@ def calibrate(
     preview_ticks: int,
     memory_settings: memory.MemorySettings,
     guard_settings: guard.GuardSettings,
+    atp_releases: bool = False,
     car_effectiveness: list[float],
     motor_cars: list[int],
     car_traction_max_n: Sequence[float] = (),
@@ -96,8 +97,9 @@ def calibrate(
     line: Line | None = None,
     scenario_digest: str,
 ) -> Calibration:
-    """PARAMS of the firmware for one law on one scenario; `start_m` is where the timetable starts.
-    Raises CalibrationError or LawError with one line."""
+    """PARAMS of the firmware for one law on one scenario; `start_m` is where the timetable starts,
+    with `atp_releases` ATP's emergency brake ends at the permitted speed. Raises CalibrationError
+    or LawError with one line."""
     known = load_law(law)
     params = np.zeros(1, firmware.params_dtype(known.PARAMS))
     params["core"] = firmware.calibrate_core(
@@ -121,6 +123,7 @@ def calibrate(
         raise CalibrationError(f"laws.{law_label(law)}: {where}") from None
     params["gradient_map"] = gradient_map.calibrate(map_sections)
     params["guard"] = guard.calibrate(guard_settings, vehicle.period_s)
+    params["guard"]["atp_releases"] = int(atp_releases)
     params["plausibility"] = plausibility.calibrate(
         guard_settings.plausible, vehicle.period_s, start_m, reference.length(profile) / 2**40
     )

@@ -13,8 +13,12 @@ Besides, by the speed of now:
     too fast by brake_margin, or for the target within brake_ahead       service brake, until the
                                                                          speed is permitted again
     too fast by emergency_margin, or ATP demands an emergency brake      emergency request, until
-                                                                         the train stands
+                                                                         the train stands, or as ATP
     the timetable stands and the train does                              hold brake, while it is so
+
+ATP ends its emergency brake at standstill, or, with atp_releases, at the permitted speed. Then an
+emergency request ends there too, and FAULT_ATP brakes while ATP demands a brake and no longer, so
+that the run goes on.
 
 The target is ATP's: v_t at a distance d. With v and s the speed reached and the way passed in a
 time of look-ahead, if the present acceleration lasts, it is too fast if v^2 - v_t^2 > 2 b (d - s).
@@ -30,7 +34,7 @@ that disagree: `plausibility.reaction_ticks`, by how much.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -96,6 +100,7 @@ REACTIONS = {
 FAULTS_THAT_BRAKE = sum(
     fault for fault, reaction in REACTIONS.items() if reaction == GUARD_SERVICE_BRAKE
 )
+FAULTS_BUT_ATP = FAULTS_THAT_BRAKE - FAULT_ATP  # where that brakes no longer than ATP demands
 
 # Supervision and Quality, as in ATP_LIMIT and TRAIN_SPEED.
 ATP_WARNING, ATP_SERVICE_BRAKE, ATP_EMERGENCY_BRAKE = values(
@@ -123,6 +128,8 @@ PARAMS = np.dtype(
         ("brake_max", np.int32),  # least, negative
         ("acceleration_max", np.int32),  # m/s^2, Q27: above it the command does not grow
         ("period", np.int32),  # Ts, s, Q30, below 2^27
+        ("atp_releases", np.int32),  # 1: ATP's emergency brake ends at the permitted speed
+        ("padding", np.int32),
     ],
     align=True,
 )
@@ -161,25 +168,35 @@ STATE = np.dtype(
 UNITS = {Q_ACCELERATION: "_m_s2", Q_SPEED: "_m_s"}
 
 
+# What the formats hold; where a number counts in ticks, `calibrate` says more.
+Age = Annotated[int, msgspec.Meta(ge=1, le=AGE_MAX_TICKS)]
+Jump = Annotated[int, msgspec.Meta(ge=1, le=e2e.DELTA_ANY)]
+Speed = Annotated[float, msgspec.Meta(ge=0, lt=128)]
+Acceleration = Annotated[float, msgspec.Meta(ge=0, lt=16)]
+Brake = Annotated[float, msgspec.Meta(gt=-16, lt=16)]  # of either sign
+Jerk = Annotated[float, msgspec.Meta(gt=0, le=1e4)]
+Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e4)]
+
+
 class GuardSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What the guard tolerates and how it brakes; none turns a limit off."""
 
-    age_max_ticks: int = 10  # an older message brakes
-    counter_jump_max: int = e2e.DELTA_MAX  # MaxDeltaCounter of the end-to-end check
-    service_brake_m_s2: float = 0.8  # of the guard
-    emergency_brake_m_s2: float = 1.2  # of an emergency request; at least the service brake
-    hold_brake_m_s2: float | None = None  # at standstill, while the timetable stands
-    standstill_m_s: float = 0.02  # up to here the train stands
-    overspeed_margin_m_s: float = 2 / 3.6  # above the permitted speed, before traction is cut
-    brake_margin_m_s: float | None = None  # before the service brake comes on
-    emergency_margin_m_s: float | None = None  # before an emergency request
-    cut_ahead_s: float = 0.0  # look-ahead towards ATP's target: traction is cut
-    brake_ahead_s: float = 0.0  # the service brake comes on
-    target_brake_m_s2: float | None = None  # counted on towards it; none: the service brake
-    traction_max_m_s2: float | None = None  # of the command, as specific force
-    brake_max_m_s2: float | None = None  # likewise
-    jerk_max_m_s3: float | None = None  # of the command; brakes of the guard have none
-    acceleration_max_m_s2: float | None = None  # measured: above it the command does not grow
+    age_max_ticks: Age = 10  # an older message brakes
+    counter_jump_max: Jump = e2e.DELTA_MAX  # MaxDeltaCounter of the end-to-end check
+    service_brake_m_s2: Brake = 0.8  # of the guard
+    emergency_brake_m_s2: Brake = 1.2  # of an emergency request; at least the service brake
+    hold_brake_m_s2: Brake | None = None  # at standstill, while the timetable stands
+    standstill_m_s: Speed = 0.02  # up to here the train stands
+    overspeed_margin_m_s: Speed = 2 / 3.6  # above the permitted speed, before traction is cut
+    brake_margin_m_s: Speed | None = None  # before the service brake comes on
+    emergency_margin_m_s: Speed | None = None  # before an emergency request
+    cut_ahead_s: Seconds = 0.0  # look-ahead towards ATP's target: traction is cut
+    brake_ahead_s: Seconds = 0.0  # the service brake comes on
+    target_brake_m_s2: Brake | None = None  # counted on towards it; none: the service brake
+    traction_max_m_s2: Acceleration | None = None  # of the command, as specific force
+    brake_max_m_s2: Brake | None = None  # likewise
+    jerk_max_m_s3: Jerk | None = None  # of the command; brakes of the guard have none
+    acceleration_max_m_s2: Acceleration | None = None  # above it the command does not grow
     plausible: PlausibleSettings = PlausibleSettings()
 
 
@@ -360,9 +377,19 @@ def must_cut(params: Record, seen: Record) -> Int:
 @step
 def must_brake(params: Record, seen: Record) -> Int:
     """1 if the service brake has to come on."""
+    if int64(params.atp_releases) != 0 and int64(seen.supervision) >= ATP_SERVICE_BRAKE:
+        return int64(1)
     return is_above(seen, int64(params.brake_margin)) | is_too_fast_for_target(
         params, seen, int64(params.brake_ahead)
     )
+
+
+@step
+def ends_as_atp(params: Record, seen: Record) -> Int:
+    """1 if ATP's emergency brake ends at the permitted speed, and this is one."""
+    if int64(params.atp_releases) == 0:
+        return int64(0)
+    return int64(1) - is_above(seen, int64(0))
 
 
 # What is done.
@@ -374,7 +401,7 @@ def latch(params: Record, state: Record, seen: Record) -> None:
     demanded = int64(seen.supervision) >= ATP_EMERGENCY_BRAKE
     if demanded or is_above(seen, int64(params.emergency_margin)) != 0:
         state.emergency = 1
-    elif stands(params, seen) != 0:
+    elif stands(params, seen) != 0 or ends_as_atp(params, seen) != 0:
         state.emergency = 0
     if must_brake(params, seen) != 0:
         state.braking = 1
@@ -388,7 +415,10 @@ def state_of(params: Record, state: Record, seen: Record, faults: Int) -> Int:
     latch(params, state, seen)
     if int64(state.emergency) != 0:
         return int64(GUARD_EMERGENCY)
-    if (faults & FAULTS_THAT_BRAKE) != 0 or int64(state.braking) != 0:
+    lasting = int64(FAULTS_THAT_BRAKE)
+    if int64(params.atp_releases) != 0:
+        lasting = int64(FAULTS_BUT_ATP)
+    if (faults & lasting) != 0 or int64(state.braking) != 0:
         return int64(GUARD_SERVICE_BRAKE)
     if must_cut(params, seen) != 0:
         return int64(GUARD_COAST)

@@ -22,7 +22,7 @@ Contract: `gather` and `scatter` are steps of bounded time that run inside the t
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -101,12 +101,17 @@ MEMORY_STATE = np.dtype(
 TOTAL_MAX = 1 << 48  # where the sum of a cell that no longer closes stops
 
 
+# More than any run has; `calibrate` says how many this one may have.
+Ticks = Annotated[int, msgspec.Meta(ge=0, le=1_000_000)]
+Cells = Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
+
+
 class MemorySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Grid of the learning memory; a law that recalls the last run has one int32 cell a tick, one
     that learns along the track an int32 cell every pitch of its own, whatever this says."""
 
-    decimation: int = 1  # control periods a cell
-    lead_ticks: int = 0  # what a tick learns from lies so far ahead
+    decimation: Cells = 1  # control periods a cell
+    lead_ticks: Ticks = 0  # what a tick learns from lies so far ahead
     interpolation: str = "hold"  # hold | linear
     storage: str = "int32"  # int32 | int16
 

@@ -20,7 +20,7 @@ Contract: reads and writes its own state; returns fault bits; the same few opera
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -83,17 +83,25 @@ STATE_BOUNDS = {
 }
 
 
+# What the formats hold; where a number counts in ticks, `calibrate` says more.
+Speed = Annotated[float, msgspec.Meta(ge=0, lt=128)]
+Change = Annotated[float, msgspec.Meta(ge=0, le=1e4)]
+Metres = Annotated[float, msgspec.Meta(ge=0, lt=65536)]
+Beyond = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
+Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e4)]
+
+
 class PlausibleSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What the guard believes of the sensors: more than any train does."""
 
-    speed_max_m_s: float = 127.0  # either way
-    speed_jump_m_s: float = 0.5  # what noise may add from one sample to the next
-    acceleration_max_m_s2: float = 5.0  # between samples, either way
+    speed_max_m_s: Speed = 127.0  # either way
+    speed_jump_m_s: Speed = 0.5  # what noise may add from one sample to the next
+    acceleration_max_m_s2: Change = 5.0  # between samples, either way
     # Before the start and beyond the end of the timetable; none: what the sensor can say.
-    position_margin_m: float | None = None
-    position_jump_m: float = 1.0  # what noise may add
-    progress_max_m: float = 0.5  # of the position against the sum of the speed
-    window_s: float = 2.0  # over which they are compared
+    position_margin_m: Beyond | None = None
+    position_jump_m: Metres = 1.0  # what noise may add
+    progress_max_m: Metres = 0.5  # of the position against the sum of the speed
+    window_s: Seconds = 2.0  # over which they are compared
 
 
 def calibrate(

@@ -43,8 +43,9 @@ brake comes at V_MRSP + dV_ebi, as the standard has it: traction that is still o
 above that by V_delta1 + V_delta2 at most. The service brake's curves have the train at constant
 speed until the brake is full: traction can take it past the end of authority, into the overlap.
 
-Release: warning and service brake at or below the permitted speed, the emergency brake at
-standstill; a brake stays where nothing is permitted.
+Release: warning and service brake at or below the permitted speed. The emergency brake at
+standstill, or with `emergency_release = "permitted_speed"` as the service brake: the national value
+Q_NVEMRRLS of SUBSET-026 says 0 or 1. A brake stays where nothing is permitted.
 
 All curves are tables that are made once, `atp_tables`.
 """
@@ -64,6 +65,8 @@ from ato_hil.plant_sim.track import section_at
 
 NONE, MARGIN, ETCS = 0, 1, 2
 SUPERVISIONS = {"none": NONE, "margin": MARGIN, "etcs": ETCS}
+AT_STANDSTILL, AT_PERMITTED_SPEED = 0, 1  # as Q_NVEMRRLS
+RELEASES = {"standstill": AT_STANDSTILL, "permitted_speed": AT_PERMITTED_SPEED}
 # What it demands, as in ATP_LIMIT.
 NORMAL, WARNING, SERVICE_BRAKE, EMERGENCY_BRAKE = values(
     "ATP_LIMIT", "Supervision", "normal warning service_brake emergency_brake"
@@ -88,8 +91,8 @@ Ticks = Annotated[int, msgspec.Meta(ge=1, le=10_000)]
 class StaticSpeed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A speed up to a position; the last one of a list holds on."""
 
-    until_m: Place
-    speed_m_s: PositiveSpeed
+    until_m: Place  # position up to which it holds
+    speed_m_s: PositiveSpeed  # the limit
 
 
 class Atp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -99,25 +102,40 @@ class Atp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     margin_m_s: SpeedMargin = 2 / 3.6  # of `margin`
     speeds: list[StaticSpeed] = []  # by position; none: the limits over time alone
     train_length_m: Length = 0.0  # the rear too has to leave a lower speed; gradients under it
+    # Position of the front at which it has to stand; none: no end.
     end_of_authority_m: Place | None = None
     overlap_m: Length = 0.0  # from the end of authority to the supervised location
+    # Of the train, whole; the curves count on safe_share of it.
     emergency_brake: Brake = Brake(steps=[Step(deceleration_m_s2=1.2)], build_up_s=1.0)
     safe_share: Share = 0.9  # of the emergency brake, that the curves count on
+    # Standstill or permitted_speed (Q_NVEMRRLS of SUBSET-026: 0 or 1): when an emergency brake
+    # ends, also one that the controller requests; with permitted_speed its guard brakes no longer
+    # than ATP.
+    emergency_release: str = "standstill"
+    # Of the train.
     service_brake: Brake = Brake(steps=[Step(deceleration_m_s2=0.8)], build_up_s=1.0)
-    t_bs1_s: Seconds | None = None  # none: build-up time of the service brake
-    t_bs2_s: Seconds | None = None
-    traction_cut_off_s: Seconds = 0.5
-    warning_cuts_traction: bool = False
-    t_warning_s: Seconds = 2.0
-    t_driver_s: Seconds = 4.0
+    # Time that the service brake counts as late; none: its build-up time.
+    t_bs1_s: Seconds | None = None
+    t_bs2_s: Seconds | None = None  # likewise, for the curve before the emergency brake
+    traction_cut_off_s: Seconds = 0.5  # from an order to the end of traction
+    warning_cuts_traction: bool = False  # a warning already orders that
+    t_warning_s: Seconds = 2.0  # from warning to service brake
+    t_driver_s: Seconds = 4.0  # from the permitted speed to the service brake
     speed_under_reading_m_s: SpeedMargin = 0.0  # V_delta0
-    a_1_m_s2: Acceleration | None = None  # none: the largest that train and track can give
+    # Largest acceleration until traction is off; none: what train and track can give.
+    a_1_m_s2: Acceleration | None = None
+    # Largest acceleration once traction is off; none: likewise.
     a_2_m_s2: Acceleration | None = None
     command_age_max_ticks: Ticks = 30  # without a valid command the vehicle brakes
 
     def __post_init__(self) -> None:
         if self.supervision not in SUPERVISIONS:
             raise ValueError(f"supervision is {self.supervision!r}, expected none, margin or etcs")
+        if self.emergency_release not in RELEASES:
+            raise ValueError(
+                f"emergency_release is {self.emergency_release!r},"
+                " expected standstill or permitted_speed"
+            )
         if self.end_of_authority_m is not None and self.supervision != "etcs":
             raise ValueError("end_of_authority_m needs supervision etcs")
         if self.t_driver_s < self.t_warning_s:
@@ -175,6 +193,7 @@ PARAMS = np.dtype(
         ("supervision", np.int64),
         ("margin_m_s", np.float64),
         ("warning_cuts_traction", np.int64),
+        ("emergency_release", np.int64),
     ]
 )
 
@@ -199,6 +218,7 @@ def calibrate(atp: Atp) -> np.ndarray:
     params["supervision"] = SUPERVISIONS[atp.supervision]
     params["margin_m_s"] = atp.margin_m_s
     params["warning_cuts_traction"] = int(atp.warning_cuts_traction)
+    params["emergency_release"] = RELEASES[atp.emergency_release]
     return params
 
 
@@ -253,7 +273,7 @@ def supervise(
     if params.supervision == ETCS:
         find_curves(limits, state, position_m)
     if params.supervision != NONE:
-        decide(state, speed_m_s)
+        decide(params, state, speed_m_s)
 
 
 @step
@@ -326,7 +346,17 @@ def curve_speed(knots: Any, target: Any, kind: Any, position_m: Any) -> Any:
 
 
 @step
-def decide(state: Any, speed_m_s: Any) -> None:
+def releases_emergency(params: Any, state: Any, speed_m_s: Any) -> Any:
+    """1 if the speed is one at which an emergency brake may end."""
+    if speed_m_s <= STANDSTILL_M_S:
+        return int64(1)
+    permitted = speed_m_s <= state.curve_m_s[PERMITTED]
+    at_permitted = params.emergency_release == AT_PERMITTED_SPEED
+    return int64(1) if at_permitted and permitted else int64(0)
+
+
+@step
+def decide(params: Any, state: Any, speed_m_s: Any) -> None:
     """What is released at this speed, then what is demanded."""
     curve = state.curve_m_s
     may_move = curve[PERMITTED] > 0.0
@@ -334,7 +364,7 @@ def decide(state: Any, speed_m_s: Any) -> None:
         state.warning = 0
         if may_move:
             state.service = 0
-    if speed_m_s <= STANDSTILL_M_S and may_move:
+    if may_move and releases_emergency(params, state, speed_m_s) != 0:
         state.emergency = 0
     if speed_m_s > curve[WARN]:
         state.warning = 1

@@ -117,7 +117,7 @@ NODE_STATE = np.dtype(
         ),  # last valid command: channel 0 the total, or each car
         ("command_age", np.int64),  # ticks since that which all of the command was last valid for
         ("mode", np.int64),  # of the last valid FORCE_CMD
-        ("emergency_requested", np.int64),  # 1: by the controller, until standstill
+        ("emergency_requested", np.int64),  # 1: by the controller, until ATP's rule releases it
         ("refused", np.int64),  # frames that failed the end-to-end check
         ("sent", np.int64, (MESSAGE_COUNT,)),  # next end-to-end counter
         ("received", np.int64, (MESSAGE_COUNT,)),  # last end-to-end counter, -1: none
@@ -278,7 +278,7 @@ def order_brakes(params: Any, state: Any) -> None:
     requests = node.mode == EMERGENCY_REQUEST
     if requests:
         node.emergency_requested = 1
-    elif stands:
+    elif atp.releases_emergency(params.atp, state.atp, state.train.speed_m_s) != 0:
         node.emergency_requested = 0
     lost = node.command_age > params.node.command_age_max
     holds = node.mode == HOLD and stands

@@ -92,6 +92,8 @@ def params(**changes: int) -> Any:
         "brake_max": INT32_MIN,
         "acceleration_max": INT32_MAX,
         "period": round(0.01 * 2**30),
+        "atp_releases": 0,
+        "padding": 0,
     }
     assert set(fields) == set(guard.PARAMS.names or ())
     return SimpleNamespace(**fields | changes)
@@ -305,6 +307,33 @@ def check_a_fault_keeps_the_brake_on_after_an_emergency(guard: Any) -> None:
     kept = state(emergency=1)
     assert guard.state_of(params(), kept, seen(), FAULT_ATP) == GUARD_EMERGENCY
     assert guard.state_of(params(), kept, seen(speed=0), FAULT_ATP) == GUARD_SERVICE_BRAKE
+
+
+def check_what_ends_with_an_atp_that_releases(guard: Any) -> None:
+    """Emergency and service brake go on until the speed is permitted, whatever ATP has demanded."""
+    setting = params(atp_releases=1, overspeed_margin=V)
+    kept = state()
+    for supervision, above, expected in (
+        (1, 0, GUARD_COAST),
+        (2, 0, GUARD_SERVICE_BRAKE),
+        (0, 1, GUARD_SERVICE_BRAKE),
+        (1, 0, GUARD_SERVICE_BRAKE),
+        (0, 0, GUARD_NORMAL),
+        (3, 0, GUARD_EMERGENCY),
+        (0, 1, GUARD_EMERGENCY),
+        (0, 0, GUARD_NORMAL),
+        (3, 0, GUARD_EMERGENCY),
+        (2, 0, GUARD_SERVICE_BRAKE),
+        (0, 0, GUARD_NORMAL),
+    ):
+        now = seen(supervision=supervision, speed=PERMITTED + above)
+        found = guard.state_of(setting, kept, now, FAULT_ATP)
+        assert found == expected, (supervision, above)
+    kept = state(emergency=1)
+    now = seen(speed=STANDSTILL, permitted_speed=0)
+    assert guard.state_of(setting, kept, now, 0) == GUARD_NORMAL
+    for fault in BRAKING - {FAULT_ATP}:
+        assert guard.state_of(setting, state(), seen(), fault) == GUARD_SERVICE_BRAKE
 
 
 def check_the_hold_brake_needs_a_train_and_a_timetable_that_stand(guard: Any) -> None:

@@ -364,6 +364,16 @@ def test_the_emergency_brake_is_released_at_standstill_only():
     assert supervised.at(800.0, 0.01) == atp.NORMAL
 
 
+def test_the_emergency_brake_is_released_at_the_permitted_speed_if_that_is_the_rule():
+    supervised = authority_at(emergency_release="permitted_speed")
+    emergency, permitted = (supervised.speed(kind, 800.0) for kind in (atp.EBI, atp.PERMITTED))
+    assert supervised.at(800.0, emergency + 0.01) == atp.EMERGENCY_BRAKE
+    assert supervised.at(800.0, permitted + 0.01) == atp.EMERGENCY_BRAKE
+    assert supervised.at(800.0, permitted) == atp.NORMAL
+    assert supervised.at(1081.0, 0.001) == atp.EMERGENCY_BRAKE
+    assert supervised.at(1081.0, 0.0) == atp.EMERGENCY_BRAKE  # where nothing is permitted
+
+
 def test_beyond_the_authority_the_brake_stays():
     supervised = authority_at()
     assert supervised.at(1001.0, 0.0) == atp.NORMAL
@@ -606,6 +616,10 @@ def test_an_emergency_brake_builds_up_after_traction_ended_and_lasts_to_standsti
 @pytest.mark.parametrize(
     ("tables", "expected"),
     [
+        (
+            {"emergency_release": "never"},
+            "key atp: emergency_release is 'never', expected standstill or permitted_speed",
+        ),
         ({"supervision": "mild"}, "key atp: supervision is 'mild', expected none, margin or etcs"),
         (
             {"supervision": "margin", "end_of_authority_m": 1.0},

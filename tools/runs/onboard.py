@@ -53,6 +53,7 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
             preview_ticks=scenario.control.preview_ticks,
             memory_settings=_settings("control.memory", scenario.control.memory, MemorySettings),
             guard_settings=_settings("control.guard", scenario.control.guard, GuardSettings),
+            atp_releases=scenario.atp.emergency_release == "permitted_speed",
             car_effectiveness=list(scenario.train.effectiveness) if distribute else [],
             motor_cars=list(scenario.train.motor_cars),
             car_traction_max_n=scenario.train.traction_max_n,
