@@ -95,21 +95,23 @@ STATE_BOUNDS = {
 class RebasingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """When a train leaves its timetable, and how it moves then."""
 
-    error_max_m: Positive  # against its timetable; below the bound of the law's barrier
-    separation_max_m: Positive = 2.0  # of a distance against S0
+    # Against its timetable, or a train leaves it; below the bound of the law's barrier.
+    error_max_m: Positive
+    separation_max_m: Positive = 2.0  # of a distance against S0, or it leaves it
     l1_m: Positive  # least distance of two trains
     l2_m: Positive  # largest
-    d: NotNegative = 1e7  # m^4/s^2, of the separation's potential
-    separation_max_m_s2: NotNegative = 0.8  # its share of a_r
-    consensus_1_s: NotNegative = 1.0  # h
+    d: NotNegative = 1e7  # m^4/s^2: strength of the separation's potential
+    separation_max_m_s2: NotNegative = 0.8  # largest share of the separation in a_r
+    consensus_1_s: NotNegative = 1.0  # h, of the speeds of the neighbours
     # a_e; none: the most that ATP's emergency brake gives, so that no train counts on less than the
     # one ahead can do
     emergency_brake_m_s2: NotNegative | None = None
     # -a_min; none: a_e + 0.2, so that a train that heard of a brake late makes up for it
     brake_max_m_s2: Positive | None = None
-    traction_max_m_s2: Positive = 0.8  # a_max
-    speed_max_m_s: Positive  # v_max
-    return_gain_1_s2: NotNegative = 0.001  # g
+    traction_max_m_s2: Positive = 0.8  # largest a_r
+    speed_max_m_s: Positive  # largest v_r
+    return_gain_1_s2: NotNegative = 0.001  # g, of the way back to the timetable
+    # Of S0: the way back to the timetable begins with every neighbour so near.
     return_within_m: NotNegative = 20.0
 
 

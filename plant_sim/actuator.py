@@ -27,8 +27,8 @@ class Actuator(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     force_max_m_s2: Positive  # largest specific force of the whole train
     delay_ticks: int = 0  # from command to actuator
-    lag_traction_s: Lag = 0.0
-    lag_brake_s: Lag = 0.0
+    lag_traction_s: Lag = 0.0  # time constant, first order, while the force is positive
+    lag_brake_s: Lag = 0.0  # while it is negative
     jerk_max_m_s3: NotNegative = 0.0  # slope of the command
     recuperation_efficiency: Efficiency = 0.0  # part of the braking work that comes back
 

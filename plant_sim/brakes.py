@@ -30,15 +30,15 @@ Deceleration = Annotated[float, msgspec.Meta(gt=0, le=10)]
 class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A deceleration that holds from a speed on, up to the next step's."""
 
-    above_m_s: Speed = 0.0
-    deceleration_m_s2: Deceleration
+    above_m_s: Speed = 0.0  # speed from which on it holds
+    deceleration_m_s2: Deceleration  # of the brake alone, full
 
 
 class Brake(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A brake by itself."""
 
-    steps: list[Step]
-    build_up_s: Seconds
+    steps: list[Step]  # by speed, rising from 0; 1 to 8
+    build_up_s: Seconds  # from the order until it is full
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.steps) <= STEPS_MAX:

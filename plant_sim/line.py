@@ -32,8 +32,8 @@ class Outage(
 ):
     """A time in which no packet arrives anywhere, seconds."""
 
-    from_s: Seconds
-    to_s: Seconds
+    from_s: Seconds  # time of a run at which it begins
+    to_s: Seconds  # at which it ends
 
     def __post_init__(self) -> None:
         _check_window(self.from_s, self.to_s)
@@ -45,7 +45,7 @@ class Radio(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     period_ticks: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 10  # of a train's packets
     delay_ticks: Ticks = 0  # from the measurement to the neighbour's bus
     loss: Probability = 0.0  # of a packet, for each receiver by itself
-    outages: list[Outage] = []
+    outages: list[Outage] = []  # times without any packet
 
     def __post_init__(self) -> None:
         if self.delay_ticks >= self.period_ticks * PACKETS_MAX:
@@ -63,9 +63,9 @@ class Fault(
 ):
     """What goes wrong with one train: it loses traction, or it brakes unasked."""
 
-    train: Number
-    from_s: Seconds
-    to_s: Seconds = float("inf")
+    train: Number  # its number, 1 leads
+    from_s: Seconds  # time of a run at which it begins
+    to_s: Seconds = float("inf")  # at which it ends
     traction_share: Annotated[float, msgspec.Meta(ge=0, lt=1)] | None = None  # of the largest force
     brake_m_s2: Annotated[float, msgspec.Meta(gt=0, le=10)] | None = None  # deceleration
     emergency: bool = False  # ATP says so: supervision is emergency_brake while it brakes
@@ -81,18 +81,18 @@ class Fault(
 class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What is different for a train: tables on top of the scenario's."""
 
-    train: dict[str, Any] = {}
-    laws: dict[str, dict[str, Any]] = {}
+    train: dict[str, Any] = {}  # keys of [train] to replace
+    laws: dict[str, dict[str, Any]] = {}  # gains to replace, by law
 
 
 class Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Several trains in one run."""
 
-    trains: Annotated[int, msgspec.Meta(ge=2, le=TRAINS_MAX)]
-    spacing_m: Annotated[float, msgspec.Meta(gt=0, le=2000)]
-    radio: Radio = Radio()
+    trains: Annotated[int, msgspec.Meta(ge=2, le=TRAINS_MAX)]  # how many
+    spacing_m: Annotated[float, msgspec.Meta(gt=0, le=2000)]  # S0, from front to front
+    radio: Radio = Radio()  # what neighbours hear of each other
     members: list[Member] = []  # of train 1, 2, …, and from the first again
-    faults: list[Fault] = []
+    faults: list[Fault] = []  # what goes wrong with its trains
 
     def __post_init__(self) -> None:
         seen = set()

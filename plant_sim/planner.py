@@ -48,8 +48,8 @@ class PlanError(InputError):
 class SpeedLimit(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A limit over time, from the end of the one before it (exclusive) to `until_s` (inclusive)."""
 
-    until_s: Positive
-    speed_m_s: Positive
+    until_s: Positive  # time of the run up to which it holds
+    speed_m_s: Positive  # the limit
 
 
 class Ramp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -61,15 +61,15 @@ class Ramp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     the duration of a ramp whose acceleration is a raised cosine.
     """
 
-    to_m_s: NotNegative | Literal["solved"] | None = None
-    to_km_h: NotNegative | None = None
-    by_m_s: Change | None = None
-    start_s: NotNegative | None = None
-    end_s: NotNegative | None = None
-    after_s: NotNegative | None = None
-    acceleration_m_s2: Positive | None = None
-    jerk_m_s3: Positive | None = None
-    sinusoidal_s: Positive | None = None
+    to_m_s: NotNegative | Literal["solved"] | None = None  # target speed, or "solved"
+    to_km_h: NotNegative | None = None  # target speed
+    by_m_s: Change | None = None  # change from the speed before
+    start_s: NotNegative | None = None  # time of the run at which it begins
+    end_s: NotNegative | None = None  # at which it ends
+    after_s: NotNegative | None = None  # of cruising since the ramp before
+    acceleration_m_s2: Positive | None = None  # largest acceleration, either way
+    jerk_m_s3: Positive | None = None  # largest jerk, either way
+    sinusoidal_s: Positive | None = None  # duration of a raised cosine
 
     def __post_init__(self) -> None:
         if _given(self.to_m_s, self.to_km_h, self.by_m_s) != 1:
@@ -84,8 +84,8 @@ class Ramp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 class Stop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A stop of a service."""
 
-    position_m: Position
-    name: str = ""
+    position_m: Position  # of the front when it stands
+    name: str = ""  # for tables and charts
     run_s: Positive | None = None  # from the stop before; none: the first, or objective "time"
     dwell_s: NotNegative = 0.0  # from arrival to departure; of the last, to the end of the run
     held_s: NotNegative = 0.0  # departs so much later than the timetable has it
@@ -96,20 +96,20 @@ class ProfilePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     `objective`, found by `running` from line, train and timetable; with `stops` a whole service,
     `service`."""
 
-    objective: Literal["time", "energy"] | None = None
+    objective: Literal["time", "energy"] | None = None  # what the plan saves; none: `ramps` say all
     duration_s: Positive | None = None  # none: that of least time, with objective "time"
     distance_m: Positive | None = None  # met within 1 mm; none: what the ramps give
-    max_speed_m_s: Positive
-    max_acceleration_m_s2: Positive
+    max_speed_m_s: Positive  # more is refused
+    max_acceleration_m_s2: Positive  # likewise; without max_deceleration_m_s2 either way
     max_deceleration_m_s2: Positive | None = None  # with an objective; none: as the acceleration
-    max_jerk_m_s3: Positive
-    ramps: tuple[Ramp, ...] = ()
+    max_jerk_m_s3: Positive  # likewise, either way
+    ramps: tuple[Ramp, ...] = ()  # changes of speed, in the order of time
     stops: tuple[Stop, ...] = ()  # with an objective, instead of duration_s and distance_m
     from_stop: int = 1  # the part of `stops` that is run; 1 is the first
     to_stop: int | None = None  # none: the last
-    # With an objective: part of the train's forces that it uses, the rest is for control; and part
-    # of the braking work that counts as won back.
+    # With an objective: part of the train's forces that it uses, the rest is for control.
     force_share: Share = 0.9
+    # With an objective: part of the braking work that counts as won back.
     recuperated_share: Share = 0.0
     limits: tuple[SpeedLimit, ...] = ()  # none: no limit over time
     limit_above_m_s: Positive | None = None  # instead of `limits`: so much above the reference

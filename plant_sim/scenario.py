@@ -6,9 +6,9 @@ this file states. Found by name among the packaged scenarios, or as the path of 
 relative to the file that names it). `unset = ["control.guard.jerk_max_m_s3"]` takes keys of the
 base away, so that their defaults count.
 
-One file may hold named cases: `[cases.VI]` states what that case replaces, and `gradient:VI` (or
-`my.toml:VI`) is the scenario with it. `yizhuang@3-6` is the part of a service from its third stop
-to its sixth.
+One file may hold named cases: `[cases.VI]` states what that case replaces, its own `unset` what it
+takes away, and `gradient:VI` (or `my.toml:VI`) is the scenario with it. `yizhuang@3-6` is the part
+of a service from its third stop to its sixth.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Sensors(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     location: str = "front"  # front | mean (of front and rear)
     position_step_m: NotNegative = 0.0  # quantisation on top of the DBC's
-    speed_step_m_s: NotNegative = 0.0
+    speed_step_m_s: NotNegative = 0.0  # likewise, of the speed
     speed_noise_m_s: NotNegative = 0.0  # standard deviation, white
 
     def __post_init__(self) -> None:
@@ -85,7 +85,7 @@ class Sensors(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Load disturbance, uniform, new in each run."""
 
-    amplitude_m_s2: NotNegative = 0.0
+    amplitude_m_s2: NotNegative = 0.0  # largest specific force, either way
     hold_ticks: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 1  # a value stays for so many ticks
 
 
@@ -97,8 +97,8 @@ class RunLength(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     the profile in that time.
     """
 
-    shortest_s: Positive
-    longest_s: Positive
+    shortest_s: Positive  # least length of a run
+    longest_s: Positive  # largest
     first_s: Positive | None = None  # length of run 1, as a paper may give it
     reading: str = "cut"  # cut | stretched
 
@@ -144,8 +144,8 @@ class Metrics(
 ):
     """Window of the errors in the summary; the whole run by default."""
 
-    from_s: NotNegative = 0.0
-    to_s: Annotated[float, msgspec.Meta(gt=0)] = float("inf")
+    from_s: NotNegative = 0.0  # time of a run from which on errors count
+    to_s: Annotated[float, msgspec.Meta(gt=0)] = float("inf")  # and up to which
 
     def __post_init__(self) -> None:
         if self.to_s <= self.from_s:
@@ -160,8 +160,8 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     distribute: bool = False  # give each car a force of its own
     mass_error: MassError = 0.0  # the controller works with (1 + mass_error) times the true mass
     map_share: Share = 0.0  # part of the resistance of the track that the onboard map has
-    memory: dict[str, Any] = {}
-    guard: dict[str, Any] = {}
+    memory: dict[str, Any] = {}  # of a law that learns: the grid of what it learns
+    guard: dict[str, Any] = {}  # what the guard tolerates and how it brakes
     neighbours: dict[str, Any] = {}  # of a line
     rebasing: dict[str, Any] | None = None  # of a line; none: its trains keep their timetables
 
@@ -169,26 +169,26 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """All of a scenario, as validated."""
 
-    title: str
+    title: str  # what it is, for tables and pages
     law: str  # default law
     runs: Annotated[int, msgspec.Meta(le=RUNS_MAX)]  # default number of runs
     period_s: Positive  # control period
-    train: AnyTrain
-    profile: ProfilePlan
-    actuator: Actuator
+    train: AnyTrain  # the plant; `model` says which: lumped, couplers or point
+    profile: ProfilePlan  # the reference that the train is to follow, and the limits over time
+    actuator: Actuator  # from the force that is commanded to the one that acts
     laws: dict[str, dict[str, Any]]  # gains of each law that the scenario supports
-    track: Track = Track()
-    sensors: Sensors = Sensors()
-    disturbance: Disturbance = Disturbance()
-    atp: Atp = Atp()
+    track: Track = Track()  # resistance by position
+    sensors: Sensors = Sensors()  # what the controller is told of position and speed
+    disturbance: Disturbance = Disturbance()  # a random load
+    atp: Atp = Atp()  # what supervises the train, and its safety brakes
     run_length: RunLength | None = None  # none: every run lasts as long as the profile
-    start: Start = Start()
+    start: Start = Start()  # where the train stands when a run begins; by default on its mark
     changes: list[Change] = []  # plant and sensors from a run on, in the order of their runs
-    control: Control = Control()
-    metrics: Metrics = Metrics()
+    control: Control = Control()  # settings of the controller besides the gains
+    metrics: Metrics = Metrics()  # from when to when errors count
     line: Line | None = None  # several trains; none: one
     tuning: dict[str, str] = {}  # how the gains of each law were found, for who compares them
-    base: str = ""
+    base: str = ""  # name or file of the scenario whose values count where this one states none
 
 
 class Loaded(msgspec.Struct, frozen=True):
@@ -341,7 +341,7 @@ def _content(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
         except ScenarioError as error:
             raise ScenarioError(f"{path}: key `base`: {error}") from None
         inherited = _in_case(below, case, _content(below, (*seen, path)))
-        content = _merged(_without(path, inherited, content), content)
+        content = _merged(_without(str(path), inherited, content), content)
     elif "unset" in content:
         raise ScenarioError(f"{path}: key unset: there is no base of which to unset keys")
     content.pop("unset", None)
@@ -356,11 +356,12 @@ def whole(path: Path) -> dict[str, Any]:
     return content
 
 
-def _without(path: Path, inherited: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
-    """What a base gives, without the keys that `unset` of `content` names."""
+def _without(place: str, inherited: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
+    """What a base gives, or a scenario its case, without the keys that `unset` of `content`
+    names."""
     keys = content.get("unset", [])
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
-        raise ScenarioError(f"{path}: key unset: expected a list of keys, as train.start_m")
+        raise ScenarioError(f"{place}: key unset: expected a list of keys, as train.start_m")
     result = copy.deepcopy(inherited)
     for key in keys:
         *tables, last = key.split(".")
@@ -368,7 +369,7 @@ def _without(path: Path, inherited: dict[str, Any], content: dict[str, Any]) -> 
         for step in tables:
             table = table.get(step) if isinstance(table, dict) else None
         if not isinstance(table, dict) or last not in table:
-            raise ScenarioError(f"{path}: key unset: the base has no {key}")
+            raise ScenarioError(f"{place}: key unset: there is no {key} to unset")
         del table[last]
     return result
 
@@ -404,7 +405,9 @@ def _in_case(path: Path, case: str, content: dict[str, Any]) -> dict[str, Any]:
     if case not in cases:
         known = expected(case, cases) if cases else "the scenario has none"
         raise ScenarioError(f"{path}: case {case!r} is unknown, {known}")
-    return _merged(content, cases[case])
+    whole = _merged(_without(_place(path, case), content, cases[case]), cases[case])
+    whole.pop("unset", None)
+    return whole
 
 
 def _cases(path: Path, content: dict[str, Any]) -> dict[str, dict[str, Any]]:

@@ -86,11 +86,11 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains in the paper's units."""
 
-    alpha: Gain  # 1/s
-    g0: Gain  # N s/m
-    g1: NotNegative  # 1/s
-    g2: NotNegative  # N/m
-    eps1: Annotated[float, msgspec.Meta(gt=0)]  # m/s
+    alpha: Gain  # 1/s: of the position error in delta
+    g0: Gain  # N s/m: gain of delta
+    g1: NotNegative  # 1/s: leak of h
+    g2: NotNegative  # N/m: growth of h
+    eps1: Annotated[float, msgspec.Meta(gt=0)]  # m/s: softens the sign; see above
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

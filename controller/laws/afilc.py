@@ -113,19 +113,20 @@ Bounds = tuple[float, float]
 class CommonGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains of this law and of `afilc_track`, SI; forces are those of a kilogram."""
 
-    beta: Gain  # 1/s
-    psi1: Gain  # 1/s
-    kv: Positive  # m/s
-    Gamma: tuple[NotNegative, NotNegative, NotNegative]  # of a, b, c
-    Gamma_w: NotNegative  # of each w_l
-    kappa: NotNegative
-    a: Bounds  # m/s^2
-    b: Bounds  # 1/s
-    c: Bounds  # 1/m
-    w: Bounds  # m/s^2, of each rule
-    rho_max: NotNegative  # m/s^2
-    feedforward: bool = False  # h is added
-    eps: NotNegative = 0.0  # m/s, half the boundary layer; 0: sgn
+    beta: Gain  # 1/s: gain of phi
+    psi1: Gain  # 1/s: of the position error in phi, and of the speed error in F
+    kv: Positive  # m/s: where the barrier stands, |phi| = kv
+    # Learning rates of a, b, c: alpha in m/s to theta in m/s^2, 1/s, 1/m.
+    Gamma: tuple[NotNegative, NotNegative, NotNegative]
+    Gamma_w: NotNegative  # 1/s: learning rate of each w_l
+    kappa: NotNegative  # 1/s: learning rate of rho
+    a: Bounds  # m/s^2: bounds of the estimate of the constant resistance
+    b: Bounds  # 1/s: bounds of that of v
+    c: Bounds  # 1/m: bounds of that of v^2
+    w: Bounds  # m/s^2: bounds of what each rule has learned
+    rho_max: NotNegative  # m/s^2: largest robust part
+    feedforward: bool = False  # the reference's acceleration h is added
+    eps: NotNegative = 0.0  # m/s: half the boundary layer of the sign; 0: sgn
 
     def __post_init__(self) -> None:
         for name in ("a", "b", "c", "w"):
@@ -135,10 +136,12 @@ class CommonGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 class Gains(CommonGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper."""
 
-    multiple: Quadruple = (-3.0, 1.0, -1.0, 2.0)  # centres, times the reference
-    centre_m: Quadruple = (0.0, 0.0, 0.0, 0.0)  # and so much on top
+    # Of each rule: its centre is so many times the reference.
+    multiple: Quadruple = (-3.0, 1.0, -1.0, 2.0)
+    centre_m: Quadruple = (0.0, 0.0, 0.0, 0.0)  # of each rule: and so much on top
+    # Of each rule: width of its membership over position.
     sigma_m: tuple[Length, Length, Length, Length] = (50.0, 30.0, 35.0, 40.0)
-    # Those of the speed memberships; 0: the speed does not count.
+    # Of each rule: width over speed; 0: the speed does not count.
     sigma_m_s: tuple[NotNegative, NotNegative, NotNegative, NotNegative] = (50.0, 30.0, 35.0, 40.0)
 
 

@@ -30,10 +30,10 @@ ESTIMATES = (*WORDS, ("delta", "m/s", Q_ERROR))
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper, SI: forces in N, M in kg."""
 
-    alpha: Gain  # 1/s
-    beta: Gain  # N s/m
-    Gamma: tuple[Gain, Gain, Gain]  # diagonal
-    Xi_initial: tuple[float, float, float]  # N, N s/m, N s^2/m^2
+    alpha: Gain  # 1/s: of the position error in delta
+    beta: Gain  # N s/m: gain of delta
+    Gamma: tuple[Gain, Gain, Gain]  # learning rates of Xi, diagonal
+    Xi_initial: tuple[float, float, float]  # before the first run: N, N s/m, N s^2/m^2
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

@@ -93,14 +93,15 @@ ESTIMATES = (*WORDS, ("delta", "m/s", Q_ERROR), ("chi", "m/s", Q_ERROR))
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper, SI: forces in N, M in kg."""
 
-    alpha: Gain  # 1/s
-    beta: Gain  # N s/m
-    Gamma: tuple[Gain, Gain, Gain]  # diagonal
-    nu_b: Annotated[float, msgspec.Meta(gt=0)]  # m/s
+    alpha: Gain  # 1/s: of the position error in delta
+    beta: Gain  # N s/m: gain of delta
+    Gamma: tuple[Gain, Gain, Gain]  # learning rates of Xi, diagonal
+    nu_b: Annotated[float, msgspec.Meta(gt=0)]  # m/s: where the barrier stands, |delta| = nu_b
+    # Largest r of the barrier; 1 is where it has no bound.
     r_max: Annotated[float, msgspec.Meta(ge=0, le=1)]
-    Xi_min: tuple[float, float, float]  # N, N s/m, N s^2/m^2
-    Xi_max: tuple[float, float, float]
-    Xi_initial: tuple[float, float, float]
+    Xi_min: tuple[float, float, float]  # lower bounds of Xi: N, N s/m, N s^2/m^2
+    Xi_max: tuple[float, float, float]  # upper bounds, likewise
+    Xi_initial: tuple[float, float, float]  # before the first run, likewise
 
     def __post_init__(self) -> None:
         for q, bounds in enumerate(zip(self.Xi_min, self.Xi_max, strict=True)):

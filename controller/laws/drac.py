@@ -156,29 +156,32 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 class TrackGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains that all laws of paper 2 have."""
 
-    z1_max_m: Positive | None = None  # none: as far as the format goes, 128 m
-    error_filter_s: NotNegative = 0.0  # 0: no filter
-    hold_force_n: NotNegative = 100e3  # brake at the stop
+    # Largest z1 that counts; none: as far as the format goes, 128 m.
+    z1_max_m: Positive | None = None
+    error_filter_s: NotNegative = 0.0  # time constant of the filter of e2; 0: no filter
+    hold_force_n: NotNegative = 100e3  # that the brake holds with at the stop
 
 
 class LoopGains(TrackGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains of the wanted acceleration."""
 
-    c1: Positive  # 1/s
-    c2: Positive  # 1/s
+    c1: Positive  # 1/s: of the position error in z2
+    c2: Positive  # 1/s: gain of z2
 
 
 class ModelGains(LoopGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains of the adaptive laws, in the paper's units: resistance in N/t, V in km/h, mass in t."""
 
-    Gamma: tuple[Positive, Positive, Positive]  # diagonal, theta in N/t with v in m/s
-    gamma: Positive  # t
-    mass_initial_t: Positive
+    # Adaptation rates of theta in N/t with v in m/s, diagonal.
+    Gamma: tuple[Positive, Positive, Positive]
+    gamma: Positive  # t: adaptation rate of the mass
+    mass_initial_t: Positive  # estimate of the mass at the start of a run
+    # Estimates of a, b, c at the start of a run: N/t with V in km/h.
     theta_initial: tuple[float, float, float]
-    theta_nominal: tuple[float, float, float]
-    theta_span: tuple[Positive, Positive, Positive]
-    freeze: bool = False
-    wmax2: Positive | None = None  # 1/s^2; none: no cap
+    theta_nominal: tuple[float, float, float]  # likewise: where eta is 0
+    theta_span: tuple[Positive, Positive, Positive]  # likewise: what eta = 1 is
+    freeze: bool = False  # no adaptation in a tick if the command before was limited
+    wmax2: Positive | None = None  # 1/s^2: what slows the adaptation down; none: nothing
 
 
 class Gains(ModelGains, frozen=True, forbid_unknown_fields=True, kw_only=True):

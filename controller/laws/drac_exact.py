@@ -66,10 +66,10 @@ ESTIMATES = (("z1", "m", 24), ("z2", "m/s", 24))
 class Gains(LoopGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains and what is known, in the paper's units: resistance in N/t, V in km/h, mass in t."""
 
-    mass_t: Positive
-    theta: tuple[float, float, float]
-    theta_swing: tuple[float, float, float] = (0.0, 0.0, 0.0)  # parts of theta
-    rad_per_s: NotNegative = 0.0
+    mass_t: Positive  # of the train
+    theta: tuple[float, float, float]  # a, b, c: N/t with V in km/h
+    theta_swing: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of each, as a part of it
+    rad_per_s: NotNegative = 0.0  # angular frequency of the swing
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

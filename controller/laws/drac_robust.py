@@ -129,10 +129,10 @@ ESTIMATES = (*MODEL_ESTIMATES, ("|eta|^2", "", 28), ("projected", "ticks", 0))
 class Gains(ModelGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains of Theorem 2: those of Theorem 1, and the sets that the estimates stay in."""
 
-    M0_squared: Positive  # of eta, in spans
-    R_in: Positive | None = None  # where the smooth projection begins; none: hard
-    mass_min_t: Positive
-    mass_max_t: Positive
+    M0_squared: Positive  # radius squared of the ball that eta stays in
+    R_in: Positive | None = None  # radius from which on the projection is smooth; none: hard
+    mass_min_t: Positive  # least estimate of the mass
+    mass_max_t: Positive  # largest
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

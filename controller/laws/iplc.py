@@ -156,26 +156,28 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 class CommonGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains that do not depend on the horizon. Inputs are for each kilogram, N/kg."""
 
-    Q: tuple[tuple[Gain, Gain], tuple[float, float]]  # of speed and position error
-    R: NotNegative  # of the change of the input
-    S: NotNegative  # of the input: energy
-    estimate: bool = False  # of phi; else phi = [1, 0]
-    gamma: Annotated[float, msgspec.Meta(ge=0, lt=2)] = 0.5
-    mu: Positive = 1.0  # m^2/s^2
-    delta: Annotated[float, msgspec.Meta(gt=0, lt=2)] = 0.5
+    # Weight of speed and position error; its first row alone counts.
+    Q: tuple[tuple[Gain, Gain], tuple[float, float]]
+    R: NotNegative  # weight of the change of the input
+    S: NotNegative  # weight of the input: energy
+    estimate: bool = False  # phi is estimated; else it is [1, 0]
+    gamma: Annotated[float, msgspec.Meta(ge=0, lt=2)] = 0.5  # step of that estimate
+    mu: Positive = 1.0  # m^2/s^2: softens it
+    delta: Annotated[float, msgspec.Meta(gt=0, lt=2)] = 0.5  # softens the prediction of phi
     m: Annotated[int, msgspec.Meta(ge=0, le=127)] = 0  # ticks of look-ahead
-    h: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0  # ticks either side in the moving average
-    kfv: Gain = 0.0  # 1/s, feedback of the current run
-    kfs: Gain = 0.0  # 1/s^2
+    # Ticks either side in the moving average of the last input.
+    h: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
+    kfv: Gain = 0.0  # 1/s: feedback of the speed error in a run
+    kfs: Gain = 0.0  # 1/s^2: of the position error
     initial: tuple[Gain, Gain] = (0.0, 0.0)  # kfv, kfs of run 0
-    slope_max: NotNegative = 0.0  # N/kg/s, 0: free
+    slope_max: NotNegative = 0.0  # N/kg/s: largest slope of the input; 0: free
 
 
 class Gains(CommonGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper; horizon and reading."""
 
-    L: Annotated[int, msgspec.Meta(ge=1, le=HORIZON_MAX)]
-    reading: Literal["A", "B"] = "A"
+    L: Annotated[int, msgspec.Meta(ge=1, le=HORIZON_MAX)]  # horizon, runs
+    reading: Literal["A", "B"] = "A"  # of (21): A as printed, B the optimum
 
 
 def matrices(gains: Gains, period_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

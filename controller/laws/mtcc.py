@@ -168,27 +168,31 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 class CommonGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains of both laws, SI, forces for each kilogram."""
 
-    alpha: NotNegative  # m^2/s^2
-    k: Positive  # m
-    beta: NotNegative  # 1/s
-    h: NotNegative  # 1/s
-    d: NotNegative  # m^4/s^2
-    l1_m: Positive
-    l2_m: Positive
+    alpha: NotNegative  # m^2/s^2: strength of the barrier
+    k: Positive  # m: where the barrier stands, |e| = k
+    beta: NotNegative  # 1/s: gain of the speed error
+    h: NotNegative  # 1/s: consensus with the neighbours
+    d: NotNegative  # m^4/s^2: strength of the separation's potential
+    l1_m: Positive  # least distance of two trains
+    l2_m: Positive  # largest
+    # From this part of k on the barrier is a straight line.
     eta: Annotated[float, msgspec.Meta(gt=0, le=0.99)] = 0.99
-    barrier_max_m_s2: Positive | None = None  # none: as far as the format goes, 16 m/s^2
-    cooperation_max_m_s2: Positive = 1.0
-    slope_max_m_s3: Positive | None = None  # none: not limited
+    # Its largest; none: as far as the format goes, 16 m/s^2.
+    barrier_max_m_s2: Positive | None = None
+    cooperation_max_m_s2: Positive = 1.0  # largest force of the potential, and of the consensus
+    slope_max_m_s3: Positive | None = None  # of the command; none: not limited
+    # No adaptation in a tick whose command slope_max cuts by more.
     freeze_above_m_s2: NotNegative = 0.05
 
 
 class Gains(CommonGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains of the law; lambda, sigma and the initial estimate of (26) to (28)."""
 
-    lam: tuple[NotNegative, NotNegative, NotNegative]  # 1/s, 1/m, s/m^2
-    sigma: tuple[NotNegative, NotNegative, NotNegative]  # 1/s
-    f_initial: float  # m/s^2
-    c: NotNegative = 0.0  # 1/s
+    # Adaptation rates of fh, a1h, a2h: 1/s, 1/m, s/m^2.
+    lam: tuple[NotNegative, NotNegative, NotNegative]
+    sigma: tuple[NotNegative, NotNegative, NotNegative]  # 1/s: their leaks
+    f_initial: float  # m/s^2: fh at the start of a run
+    c: NotNegative = 0.0  # 1/s: of the position error in s
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

@@ -56,9 +56,9 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as printed, of sums and differences a tick."""
 
-    Kp: NotNegative  # 1/s
-    Ki: NotNegative
-    Kd: NotNegative
+    Kp: NotNegative  # 1/s: of ev
+    Ki: NotNegative  # 1/s a tick: of the sum of ev
+    Kd: NotNegative  # 1/s: of the change of ev in a tick
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

@@ -78,11 +78,12 @@ ESTIMATES = (*COMMON_ESTIMATES, ("Theta", "1/s", 30), ("damping", "1/s", 20))
 class Gains(CommonGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains of the law."""
 
-    theta: NotNegative  # s/m^2
-    sigma: NotNegative  # 1/s
-    Theta_initial: NotNegative  # 1/s
-    damping_max_1_s: NotNegative | None = None  # none: as far as the format goes, 2048 1/s
-    f_prior: float = 0.0  # m/s^2
+    theta: NotNegative  # s/m^2: adaptation rate of Th
+    sigma: NotNegative  # 1/s: its leak
+    Theta_initial: NotNegative  # 1/s: Th at the start of a run
+    # Largest Th psi^2; none: as far as the format goes, 2048 1/s.
+    damping_max_1_s: NotNegative | None = None
+    f_prior: float = 0.0  # m/s^2: resistance that is fed forward
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

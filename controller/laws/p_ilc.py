@@ -61,10 +61,11 @@ ESTIMATES = (*WORDS, ("increment", "m/s^2", 27))
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper, and the input of the first run; forces are those of a kilogram."""
 
-    K1: Gain  # 1/s^2
-    K2: Gain  # 1/s
-    feedforward: bool = False
-    resistance: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s^2, 1/s, 1/m
+    K1: Gain  # 1/s^2: of the position error
+    K2: Gain  # 1/s: of the speed error
+    feedforward: bool = False  # u_0 is the reference's acceleration and the resistance; else 0
+    # Of u_0, by power of the speed: m/s^2, 1/s, 1/m.
+    resistance: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

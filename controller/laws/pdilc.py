@@ -46,11 +46,11 @@ ESTIMATES = (*WORDS, ("eps", "m/s", Q_SPEED))
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper; gp, gI, gD are those of the PID in run 0."""
 
-    kp: Gain  # N s/m
-    kD: Gain  # N s^2/m
-    gp: Gain  # N s/m
-    gI: Gain  # N/m
-    gD: Gain  # N s^2/m
+    kp: Gain  # N s/m: of the speed error, from run to run
+    kD: Gain  # N s^2/m: of its change
+    gp: Gain  # N s/m: of the PID in run 0, of the speed error
+    gI: Gain  # N/m: likewise, of its integral
+    gD: Gain  # N s^2/m: likewise, of its change
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

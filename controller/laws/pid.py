@@ -53,9 +53,9 @@ STATE_BOUNDS = {"integral": (-INTEGRAL_MAX, INTEGRAL_MAX)}
 class Gains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains as in the paper."""
 
-    gp: Gain  # N s/m
-    gI: Gain  # N/m
-    gD: Gain  # N s^2/m
+    gp: Gain  # N s/m: of the speed error
+    gI: Gain  # N/m: of its integral
+    gD: Gain  # N s^2/m: of its change
 
 
 def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:

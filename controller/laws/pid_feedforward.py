@@ -83,11 +83,11 @@ class Gains(TrackGains, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Gains for each kilogram, and the mass that the law takes the train to have; what is not given
     follows from the train."""
 
-    kp: NotNegative | None = None  # 1/s^2
-    ki: NotNegative | None = None  # 1/s^3
-    kd: NotNegative | None = None  # 1/s
-    feed_forward: NotNegative = 1.0
-    mass_t: Positive | None = None
+    kp: NotNegative | None = None  # 1/s^2: of the position error; none: from the train
+    ki: NotNegative | None = None  # 1/s^3: of its integral; none: from the train
+    kd: NotNegative | None = None  # 1/s: of the speed error; none: from the train
+    feed_forward: NotNegative = 1.0  # ff, share of a* + w(x)
+    mass_t: Positive | None = None  # that the law takes the train to have; none: what it has
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class Train(
 ):
     """The cars one by one."""
 
-    substeps: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 10
+    substeps: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 10  # integration steps a control period
 
     def __post_init__(self) -> None:
         super().__post_init__()

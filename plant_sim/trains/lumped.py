@@ -36,27 +36,27 @@ Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
 class Resistance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Davis coefficients in N/kN with V in km/h, each value + swing * sin(rad_per_s t)."""
 
-    a: tuple[float, float]
-    b: tuple[float, float]
-    c: tuple[float, float]
-    rad_per_s: float
+    a: tuple[float, float]  # constant part: value and swing, N/kN
+    b: tuple[float, float]  # times V: value and swing, N/kN a km/h
+    c: tuple[float, float]  # times V^2: value and swing, N/kN a (km/h)^2
+    rad_per_s: float  # angular frequency of the swing
 
 
 class Cars(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Data of a train of cars; each model of it takes what it needs."""
 
-    masses_kg: list[Positive]
+    masses_kg: list[Positive]  # of each car, from the front; 1 to 8 cars
     effectiveness: list[Positive]  # mu_k: force at the train per newton that a car is asked for
-    motor_cars: list[int]  # 1-based
+    motor_cars: list[int]  # those with motors, 1 is the first
     pitch_m: Positive  # distance of the cars
-    motor_resistance: Resistance
-    trailer_resistance: Resistance
+    motor_resistance: Resistance  # of the cars in motor_cars
+    trailer_resistance: Resistance  # of the others
     coupler_sine_m: list[float]  # how rigid couplers breathe: amplitude of sin(t) in s^(k)
     coupler_cosine_m: list[float]  # amplitude of cos(t)
     coupler_stiffness_n_m: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.0  # of elastic couplers
-    coupler_damping_n_s_m: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.0
+    coupler_damping_n_s_m: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.0  # of elastic couplers
     traction_max_n: list[float] = []  # what each car can give; none: as much as CAR_FORCE carries
-    brake_max_n: list[float] = []
+    brake_max_n: list[float] = []  # likewise, when braking
 
     def __post_init__(self) -> None:
         cars = len(self.masses_kg)
@@ -90,7 +90,7 @@ class Train(
 ):
     """The cars as one mass."""
 
-    substeps: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 5
+    substeps: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 5  # integration steps a control period
 
 
 OSCILLATOR = np.dtype([("sine", np.float64), ("cosine", np.float64)])

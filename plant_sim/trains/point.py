@@ -13,7 +13,7 @@ the period. The sine comes from an exact rotation, no libm.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -29,28 +29,29 @@ from ato_hil.plant_sim.trains.lumped import (
     small_rotation,
 )
 
+Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
+Mass = Annotated[float, msgspec.Meta(gt=0, le=1e8)]
+Power = Annotated[float, msgspec.Meta(gt=0, le=1e12)]
+Place = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+Substeps = Annotated[int, msgspec.Meta(ge=1, le=1000)]
+
 
 class Resistance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Davis resistance for each kilogram, each coefficient value + swing * sin(rad_per_s t)."""
 
-    constant: tuple[float, float]  # m/s^2
-    linear: tuple[float, float]  # 1/s
-    square: tuple[float, float]  # 1/m
-    rad_per_s: float = 0.0
+    constant: tuple[float, float]  # value and swing, m/s^2
+    linear: tuple[float, float]  # times v: value and swing, 1/s
+    square: tuple[float, float]  # times v^2: value and swing, 1/m
+    rad_per_s: float = 0.0  # angular frequency of the swing
 
 
 class Characteristic(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Largest force at a speed v: min(force_n - slope_n_s_m v, power_w / v)."""
 
-    force_n: float
-    slope_n_s_m: float = 0.0
-    power_w: float | None = None  # none: no such limit
-
-    def __post_init__(self) -> None:
-        if self.force_n <= 0 or self.slope_n_s_m < 0:
-            raise ValueError("expected force_n above 0 and slope_n_s_m 0 or more")
-        if self.power_w is not None and self.power_w <= 0:
-            raise ValueError(f"power_w is {self.power_w:g}, expected more than 0")
+    force_n: Positive  # at standstill
+    slope_n_s_m: NotNegative = 0.0  # what the force falls by for each m/s
+    power_w: Power | None = None  # none: no such limit
 
 
 class Train(
@@ -63,14 +64,14 @@ class Train(
 ):
     """Data of the train."""
 
-    mass_kg: float
-    resistance: Resistance
+    mass_kg: Mass  # of the whole train
+    resistance: Resistance  # of the train on level track
     characteristic: Characteristic | None = None  # none: the plant gives what it is asked for
     brake: Characteristic | None = None  # none: as the traction
-    start_m: float = 0.0  # where it stands when a run begins
+    start_m: Place = 0.0  # where it stands when a run begins
     # Whether the actuators then hold it against its resistance; else they give no force.
     held_at_start: bool = False
-    substeps: int = 5
+    substeps: Substeps = 5  # integration steps a control period
 
     # What a train of several cars has: this one has no cars, its sensors are in one place.
     effectiveness = ()
@@ -83,12 +84,6 @@ class Train(
     def braking(self) -> Characteristic | None:
         """What the brakes can give."""
         return self.brake or self.characteristic
-
-    def __post_init__(self) -> None:
-        if self.mass_kg <= 0:
-            raise ValueError(f"mass_kg is {self.mass_kg:g}, expected more than 0")
-        if self.substeps < 1:
-            raise ValueError(f"substeps is {self.substeps}, expected 1 or more")
 
 
 LARGEST = np.dtype([("force_n", np.float64), ("slope_n_s_m", np.float64), ("power_w", np.float64)])

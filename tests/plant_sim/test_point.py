@@ -241,12 +241,12 @@ def scenario_error(tmp_path, text):
         ('base = "crh3"\n[track]\napplication = "smeared"\n', "key track.application: train model"),
         (
             'base = "crh3"\n[train]\nmass_kg = 0.0\n',
-            "key train: mass_kg is 0, expected more than 0",
+            "key train.mass_kg: Expected `float` > 0.0",
         ),
-        ('base = "crh3"\n[train]\nsubsteps = 0\n', "key train: substeps is 0, expected 1 or more"),
+        ('base = "crh3"\n[train]\nsubsteps = 0\n', "key train.substeps: Expected `int` >= 1"),
         (
             'base = "crh3"\n[train.characteristic]\npower_w = 0\n',
-            "key train.characteristic: power_w",
+            "key train.characteristic.power_w: Expected",
         ),
         (
             'base = "crh3-hills"\n[track]\ninterpolation = "linear"\n',

@@ -14,6 +14,7 @@ from ato_hil.plant_sim.scenario import (
     overlaid,
     scenario_names,
 )
+from ato_hil.plant_sim.track import Track
 from ato_hil.plant_sim.trains import couplers, lumped
 
 
@@ -245,19 +246,35 @@ def test_a_key_of_the_base_is_unset(write):
     assert load("crh3-learning").scenario == whole
 
 
+def test_a_case_unsets_keys_of_its_scenario(write):
+    path = write(
+        'base = "crh3-learning"\n[cases.whole]\nunset = ["run_length"]\n'
+        '[cases.other]\nunset = ["track"]\ntrack.application = "point"\n'
+    )
+    assert load(path).scenario.run_length is not None
+    assert load(f"{path}:whole").scenario.run_length is None
+    assert load(f"{path}:other").scenario.track == Track()
+    again = write(f'base = "{path}:whole"\nruns = 1', "again.toml")
+    assert load(again).scenario.run_length is None
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('base = "subway"\nunset = ["run_length"]', "key unset: the base has no run_length"),
-        ('base = "subway"\nunset = ["law.x"]', "key unset: the base has no law.x"),
+        ('base = "subway"\nunset = ["run_length"]', "key unset: there is no run_length to unset"),
+        ('base = "subway"\nunset = ["law.x"]', "key unset: there is no law.x to unset"),
         ('base = "subway"\nunset = "atp"', "key unset: expected a list of keys"),
         ('unset = ["atp"]', "key unset: there is no base"),
+        (
+            'base = "subway"\n[cases.a]\nunset = ["nothing"]',
+            "case a: key unset: there is no nothing to unset",
+        ),
         ('base = "subway"\nunset = ["period_s"]', "Object missing required field `period_s`"),
     ],
 )
 def test_what_cannot_be_unset_is_named(write, text, says):
     with pytest.raises(ScenarioError, match=re.escape(says)):
-        load(write(text))
+        load(write(text) + ":a" * ("cases.a" in text))
 
 
 def test_a_byte_order_mark_and_a_name_in_capitals_are_read(tmp_path):

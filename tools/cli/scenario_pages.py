@@ -62,7 +62,8 @@ file; `base = "NAME"` takes another one's values, and the file then states only 
 table by table (lists are replaced whole). `unset = ["run_length", "control.guard.jerk_max_m_s3"]`
 takes keys of the base away, so that their defaults count. `ato-hil new my.toml` writes a start,
 `ato-hil show NAME` the whole of a scenario with the file that each value comes from.
-`[cases.NAME]` states what a case replaces; `my.toml:NAME` is the scenario with it.
+`[cases.NAME]` states what a case replaces, its `unset` what it takes away; `my.toml:NAME` is the
+scenario with it.
 
 Every number is finite. Ranges are checked on loading, and so is whether the numbers fit the signals
 of the bus ([messages.md](messages.md)).

@@ -36,11 +36,21 @@ def test_the_page_has_every_key_with_unit_range_default_and_meaning() -> None:
     for key in ("lag_brake_s", "spacing_m", "position_margin_m", "return_within_m", "Xi_min"):
         assert f"| `{key}` |" in page
     assert "| `r_max` | number |  | from 0 to 1 | needed |" in page
-    assert "| `nu_b` | number |  | above 0 | needed | m/s |" in page
+    assert "| `delay_ticks` | whole number | ticks |  | 0 | from command to actuator |" in page
     comments = scenario_pages.comments_of(Actuator)
     assert comments["delay_ticks"] == "from command to actuator"
     assert scenario_pages.unit_of("jerk_max_m_s3") == "m/s³"
     assert scenario_pages.unit_of("runs") == ""
+
+
+def test_every_key_has_a_meaning() -> None:
+    table, without = "", []
+    for line in scenario_pages.page().splitlines():
+        if line.startswith("## "):
+            table = line
+        if line.startswith("| `") and not line.split(" | ")[-1].strip("| "):
+            without.append(f"{table}: {line}")
+    assert without == []
 
 
 @pytest.mark.parametrize("name", [*scenario_names(), "gradient:VI", "subway-atp:guarded"])
