@@ -472,6 +472,7 @@ def driven(here, commands_n):
     for tick, force in enumerate(commands_n):
         here.sense(here.params, here.limits, here.state, chance, tick, here.tx)
         word = put(FORCE_CMD.Force, saturate(FORCE_CMD.Force, int(force / FORCE_CMD.Force.scale)))
+        word += put(FORCE_CMD.Tick, tick)
         box["payload"] = e2e.protect(word, counter, FORCE_CMD.data_id)
         box["fresh"] = 1
         counter = e2e.next_counter(counter)

@@ -18,6 +18,8 @@ from hypothesis import strategies as st
 
 from ato_hil.tools.runs import can_logs
 from ato_hil.tools.runs.can_logs import RecordError, Recording
+from ato_hil.tools.runs.formats import mf4
+from ato_hil.tools.runs.formats.common import Incomplete
 from ato_hil.tools.runs.frames import FRAME, Digest
 
 SUFFIXES = ("asc", "blf", "log", "pcapng")
@@ -386,8 +388,10 @@ assert abs(back.time_s - back.time_s[0] - rows["tick"] * 0.01).max() < 1e-5
 
 content = Path("ours.mf4").read_bytes()
 middle = len(content) // 2
+cycles = content.index((2500).to_bytes(8, "little"), content.index(b"##CG"))
+more = content[:cycles] + (1 << 40).to_bytes(8, "little") + content[cycles + 8:]
 wrong = {
-    "cut": content[:middle], "stub": content[:30], "empty": b"", "text": b"nothing",
+    "more": more, "cut": content[:middle], "stub": content[:30], "empty": b"", "text": b"nothing",
     "overwritten": content[:middle] + bytes(200) + content[middle + 200:],
 }
 for name, damaged in wrong.items():
@@ -425,5 +429,46 @@ def test_mf4(tmp_path: Path) -> None:
     assert done.stderr == ""
     lines = done.stdout.splitlines()
     assert [line.partition(":")[0] for line in lines] == [
-        f"{name}.mf4" for name in ("cut", "stub", "empty", "text", "overwritten")
+        f"{name}.mf4" for name in ("more", "cut", "stub", "empty", "text", "overwritten")
     ]
+    assert lines[0].endswith(f"2500 of {1 << 40} frames that it announces could be read")
+
+
+ROW = "0.5\\t0\\t\\t16\\t-7"
+
+
+@pytest.mark.parametrize(
+    ("script", "says"),
+    [
+        (f"print('announced\\t5'); print('{ROW}'); print('{ROW}')", "2 of 5 frames that it"),
+        (f"print('{ROW}'); print('{ROW}'); print('failed\\tthis is why')", "this is why"),
+        (
+            f"import os, signal; print('{ROW}'); print('{ROW}', flush=True); print('{ROW}'[:-2],"
+            " end='', flush=True); os.kill(os.getpid(), signal.SIGXCPU)",
+            "asammdf did not come to an end within 61 s of processor time",
+        ),
+        (f"print('{ROW}'); print('{ROW}'); raise SystemExit(3)", "asammdf ended with status 3"),
+    ],
+)
+def test_whatever_ends_the_reader_of_an_mf4_what_it_had_read_counts(script: str, says: str) -> None:
+    command = [sys.executable, "-c", script]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        rows = mf4._told(child, 20_000)
+        assert [next(rows), next(rows)] == [(0.5, "0", "", 16, -7)] * 2
+        with pytest.raises(Incomplete, match=says):
+            next(rows)
+
+
+def test_the_reader_of_an_mf4_may_not_take_what_there_is() -> None:
+    script = (
+        "import sys, types\n"
+        "from ato_hil.tools.runs.formats import mf4\n"
+        "greedy = types.SimpleNamespace(MF4Reader=lambda _file: bytearray(1 << 40))\n"
+        "sys.modules['can.io.mf4'] = greedy\n"
+        "sys.argv = ['', '9']\n"
+        "mf4.main()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], input="", capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "failed\tMemoryError\n"
