@@ -197,7 +197,7 @@ class GuardSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     brake_max_m_s2: Brake | None = None  # likewise
     jerk_max_m_s3: Jerk | None = None  # of the command; brakes of the guard have none
     acceleration_max_m_s2: Acceleration | None = None  # above it the command does not grow
-    plausible: PlausibleSettings = PlausibleSettings()
+    plausible: PlausibleSettings = PlausibleSettings()  # what it believes of the sensors
 
 
 def calibrate(settings: GuardSettings, period_s: float) -> np.ndarray:
