@@ -101,6 +101,12 @@ COMMANDS = [
 ]
 
 
+def digests(listed: Path) -> dict[str, str]:
+    """What sha256sum has listed, by file."""
+    rows = [line.split(maxsplit=1) for line in listed.read_text().splitlines()]
+    return {name: digest for digest, name in rows}
+
+
 def on_full_disk(prepared: Path, command: str, left_kb: int, said: Path) -> tuple[int, list[str]]:
     """Exit status and lines of standard error; nothing that was there has changed, nothing new is
     half a file of ours."""
@@ -123,10 +129,7 @@ def on_full_disk(prepared: Path, command: str, left_kb: int, said: Path) -> tupl
     )
     if not (said / "status").exists():
         pytest.skip(f"this system does not mount a small disk for a test: {made.stderr.strip()}")
-    before, after = (
-        dict(reversed(line.split(maxsplit=1)) for line in (said / name).read_text().splitlines())
-        for name in ("before", "after")
-    )
+    before, after = (digests(said / name) for name in ("before", "after"))
     assert {name: after.get(name) for name in before} == before
     assert not [name for name in after if name.endswith(".new")]
     error = (said / "err").read_text()
