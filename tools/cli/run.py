@@ -51,6 +51,8 @@ if TYPE_CHECKING:
 
 # What a control period of a train takes, at most.
 BYTES_OF_RECORDING = 320
+MIL_TICKS_PER_S = 80  # of a train, interpreted; roughly
+LONG_MINUTES = 2.0  # said before they are spent
 LARGE_BYTES = 1e9  # said before it is written
 STARTING = "loading or compiling the steps"
 
@@ -59,9 +61,13 @@ class Screen:
     """Progress bar and table of a session; a plain line a run where there is no terminal."""
 
     def __init__(
-        self, mode: Mode, expected: Sequence[Expectation] = (), bytes_per_tick: int = 0
+        self,
+        mode: Mode,
+        expected: Sequence[Expectation] = (),
+        bytes_per_tick: int = 0,
+        pace: Pace = Pace.lockstep,
     ) -> None:
-        self.mode = mode
+        self.mode, self.pace = mode, pace
         self.expected = list(expected)
         self.bytes_per_tick = bytes_per_tick  # that a train leaves on the disk
         self.rows: list[dict[str, Any]] = []
@@ -94,6 +100,11 @@ class Screen:
         if size > LARGE_BYTES:
             text = f"this will write about {size / 1e9:.1f} GB; --trace auto keeps the trace small"
             say(text, "yellow")
+        minutes = self._seconds(len(runs) * loaded.ticks * loaded.trains, loaded) / 60
+        if minutes > LONG_MINUTES:
+            say(
+                f"this will take about {minutes:.0f} minutes; --runs 1 makes a single run", "yellow"
+            )
         say_if_compiling()
         self.task = self.bar.add_task(
             "run",
@@ -103,6 +114,12 @@ class Screen:
             rate="-",
             last=STARTING,
         )
+
+    def _seconds(self, ticks: int, loaded: Loaded) -> float:
+        """What the runs take where that is known to be long: by the clock, or interpreted."""
+        if self.pace is Pace.realtime:
+            return ticks / loaded.trains * loaded.scenario.period_s
+        return ticks / MIL_TICKS_PER_S if self.mode is Mode.mil else 0.0
 
     def note(self, text: str) -> None:
         """One line above the bar."""
@@ -306,7 +323,7 @@ def run(
             # A trace that is thinned stays small.
             whole = not no_trace and (trace is Trace.full or viewer is not None)
             size = BYTES_OF_TICK * whole + BYTES_OF_RECORDING * (record is not None)
-            summary = _run(options, Screen(mode, expected, size))
+            summary = _run(options, Screen(mode, expected, size, pace))
         _print_end(summary, replace(options, out=place.final, record=record))
         otherwise = unmet(expected, summary["runs"][-1])
         failure = fail("; ".join(otherwise), EXIT_NOT_AS_EXPECTED) if otherwise else None

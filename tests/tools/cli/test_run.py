@@ -11,7 +11,7 @@ from rich.console import Console
 from ato_hil.can_dbc import step
 from ato_hil.plant_sim.scenario import load
 from ato_hil.tools.cli import console, run
-from ato_hil.tools.cli.options import Mode
+from ato_hil.tools.cli.options import Mode, Pace
 from ato_hil.tools.runs import expect
 from ato_hil.tools.runs.expect import ExpectError, parse, unmet
 from ato_hil.tools.session import sil
@@ -117,3 +117,12 @@ def test_clean_takes_what_can_be_made_again(ato_hil, tmp_path: Path) -> None:
     assert (cache / "others").exists()
     done = ato_hil("clean", cwd=tmp_path, NUMBA_CACHE_DIR=str(cache))
     assert (cache / "others").exists()
+
+
+def test_what_takes_minutes_says_so_first(screen: io.StringIO) -> None:
+    loaded = load("subway")
+    run.Screen(Mode.sil).begin(loaded, "cailc", range(1, 1000))
+    run.Screen(Mode.mil).begin(load("subway-fast"), "cailc", range(1, 2))
+    assert screen.getvalue().count("this will take about") == 1
+    run.Screen(Mode.hil, pace=Pace.realtime).begin(loaded, "cailc", range(1, 11))
+    assert "this will take about 32 minutes" in screen.getvalue()
