@@ -192,6 +192,14 @@ def bench(
             help="Where the time of a control period in SIL goes, instead; may be repeated.",
         ),
     ] = None,
+    campaign: Annotated[
+        int | None,
+        typer.Option(
+            min=20,
+            metavar="RUNS",
+            help="Only: what a campaign of so many runs costs beside them, on one core and on two.",
+        ),
+    ] = None,
 ) -> None:
     """Measure SIL, HIL and buses as ratios to a peer in the same run."""
     from ato_hil.tools.bench import bench as rates
@@ -202,6 +210,9 @@ def bench(
         _print_parts(parts)
         return
     buses = bus or ["hub:bench"]
+    if campaign is not None:
+        _bench_campaign(campaign)
+        return
     with one_line_for_bad_input():
         if sessions:
             rows = []
@@ -239,6 +250,16 @@ def _print_parts(scenarios: list[str]) -> None:
             rows.append(Row(("without marks", f"{found.period_ns:,.0f}", "")))
             columns = [Column("part of a period", text=True), Column("ns"), Column("%")]
             show(console, columns, rows, f"{found.scenario}, {found.law}")
+
+
+def _bench_campaign(runs: int) -> None:
+    with one_line_for_bad_input(), working("") as update:
+        from ato_hil.tools.bench import campaigns
+
+        figures = list(campaigns.measure(runs, update))
+    rows = [Row((f.what, f"{f.value:.3g} {f.unit}".strip(), f.goal)) for f in figures]
+    names = (Column("campaign", text=True), Column("measured"), Column("goal"))
+    show(console, names, rows)
 
 
 def _session(figure: Figure) -> tuple[str, ...]:

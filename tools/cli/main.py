@@ -10,7 +10,18 @@ from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli import buses, clean, compare, export, lines, look, prove, run, scenarios
+from ato_hil.tools.cli import (
+    buses,
+    campaign,
+    clean,
+    compare,
+    export,
+    lines,
+    look,
+    prove,
+    run,
+    scenarios,
+)
 from ato_hil.tools.cli.console import EXIT_ENDED_EARLY, end_as_with_ctrl_c, fail, say
 from ato_hil.tools.cli.options import Viewer
 from ato_hil.tools.cli.output import ignore_other_tools, streams
@@ -42,6 +53,7 @@ COMMANDS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
     "Compare": (
         ("compare", compare.compare),
         ("sweep", compare.sweep),
+        ("campaign", campaign.campaign),
     ),
     "Prove": (
         ("claims", prove.claims),

@@ -20,10 +20,13 @@ from ato_hil.tools.runs import locks
 RUNS = Path("runs")
 RESULTS = (
     *("summary.json", "trace.rrd", "compare.json", "sweep.json"),
-    *("threats.json", "endurance.json"),
+    *("threats.json", "endurance.json", "campaign.json"),
 )
 # What is drawn from results, and is out of date without them.
-DRAWN = ("faults.csv", "report.html", "sweep.csv", "pareto.*", "figures/*-fig*.*")
+DRAWN = (
+    *("faults.csv", "report.html", "sweep.csv", "pareto.*", "figures/*-fig*.*"),
+    *("rows.parquet", "parts/*", "worst/*/*"),
+)
 UNFINISHED = "unfinished"
 
 

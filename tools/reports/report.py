@@ -69,19 +69,24 @@ def html(folder: Folder, figures: Sequence[draw.Drawn]) -> str:
         f"<h1>{escape(title)}</h1>",
         f"<p>{escape(folder.scenario.title)}</p>",
         _ended(summary),
-        _section("Session", _pairs({key: summary[key] for key in SESSION if key in summary})),
-        _section("Digests", _pairs({key: summary[key] for key in DIGESTS if key in summary})),
-        _section("Runs", _runs(folder.rows)),
-        _section("Timing", _timing(summary.get("timing"))),
+        section("Session", pairs({key: summary[key] for key in SESSION if key in summary})),
+        section("Digests", pairs({key: summary[key] for key in DIGESTS if key in summary})),
+        section("Runs", _runs(folder.rows)),
+        section("Timing", _timing(summary.get("timing"))),
         *_others(folder.rows, summary),
-        _section("Service", _service(folder)),
-        _section("Figures", _figures(figures)),
-        _section("Again", _again(folder)),
-        _section("Gains", _gains(folder)),
-        _section("Versions", _pairs(_flat(summary.get("versions", {})))),
-        _section("Machine", _pairs(_flat(summary.get("machine", {})))),
-        _section("Controller", _pairs(_flat(summary.get("controller", {})))),
+        section("Service", _service(folder)),
+        section("Figures", _figures(figures)),
+        section("Again", _again(folder)),
+        section("Gains", _gains(folder)),
+        section("Versions", pairs(_flat(summary.get("versions", {})))),
+        section("Machine", pairs(_flat(summary.get("machine", {})))),
+        section("Controller", pairs(_flat(summary.get("controller", {})))),
     ]
+    return page(title, parts)
+
+
+def page(title: str, parts: Iterable[str]) -> str:
+    """A whole document of sections, which asks no network for anything and holds no script."""
     return "\n".join(
         (
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
@@ -96,7 +101,8 @@ def html(folder: Folder, figures: Sequence[draw.Drawn]) -> str:
     )
 
 
-def _section(title: str, content: str) -> str:
+def section(title: str, content: str) -> str:
+    """With a heading; nothing without content."""
     return f"<section>\n<h2>{escape(title)}</h2>\n{content}\n</section>" if content else ""
 
 
@@ -122,12 +128,12 @@ def _runs(rows: list[dict[str, Any]]) -> str:
         for each in shown_rows(row)
     ]
     ends = {f"run {row['run']}": _plain(row) for row in (rows[0], rows[-1])}
-    parts = [_table(shown, title=str), f"<h3>Every number</h3>{_transposed(ends)}"]
+    parts = [table(shown, title=str), f"<h3>Every number</h3>{_transposed(ends)}"]
     if trains := rows[-1].get("trains"):
         of_train = {f"train {each['train']}": _plain(each) for each in trains}
         parts.append(f"<h3>Trains of run {rows[-1]['run']}</h3>{_transposed(of_train)}")
     if stops := rows[-1].get("stops"):
-        parts.append(f"<h3>Stops of run {rows[-1]['run']}</h3>{_table(stops)}")
+        parts.append(f"<h3>Stops of run {rows[-1]['run']}</h3>{table(stops)}")
     return "\n".join(parts)
 
 
@@ -139,7 +145,7 @@ def _transposed(columns: dict[str, dict[str, Any]]) -> str:
         for key in keys
         if key not in ("run", "train")
     ]
-    return _table(rows, title=str)
+    return table(rows, title=str)
 
 
 def _timing(timing: dict[str, Any] | None) -> str:
@@ -150,7 +156,7 @@ def _timing(timing: dict[str, Any] | None) -> str:
         dict(zip(("real time, µs", "p50", "p99", "p99.9", "max"), row, strict=True))
         for row in realtime.rows(timing)
     ]
-    return f"{_table(rows)}\n<p>{escape(realtime.verdict(timing))}</p>"
+    return f"{table(rows)}\n<p>{escape(realtime.verdict(timing))}</p>"
 
 
 def _plain(row: dict[str, Any]) -> dict[str, Any]:
@@ -174,13 +180,13 @@ def _others(rows: list[dict[str, Any]], summary: dict[str, Any]) -> list[str]:
     for key in keys:
         entries = [{"run": row["run"], **entry} for row in rows for entry in _entries(row.get(key))]
         if entries:
-            parts.append(_section(f"{title_of(key)} by run", _table(entries)))
+            parts.append(section(f"{title_of(key)} by run", table(entries)))
     for key, value in summary.items():
         entries = _entries(value)
         if key in KNOWN or not entries:
             continue
         single = len(entries) == 1
-        parts.append(_section(title_of(key), _pairs(entries[0]) if single else _table(entries)))
+        parts.append(section(title_of(key), pairs(entries[0]) if single else table(entries)))
     return parts
 
 
@@ -206,7 +212,7 @@ def _flat(value: dict[str, Any], stem: str = "") -> dict[str, Any]:
     return flat
 
 
-def _table(rows: Iterable[dict[str, Any]], title: Callable[[str], str] = title_of) -> str:
+def table(rows: Iterable[dict[str, Any]], title: Callable[[str], str] = title_of) -> str:
     """A row a row, a column a key; what heads a column is the key's title."""
     rows = list(rows)
     keys = list(dict.fromkeys(key for row in rows for key in row))
@@ -217,7 +223,7 @@ def _table(rows: Iterable[dict[str, Any]], title: Callable[[str], str] = title_o
     return f"<table>\n<tr>{head}</tr>\n{body}\n</table>"
 
 
-def _pairs(values: dict[str, Any]) -> str:
+def pairs(values: dict[str, Any]) -> str:
     """A row a key."""
     rows = "\n".join(
         f"<tr><th>{escape(key.replace('_', ' '))}</th><td>{_cell(value, exact=True)}</td></tr>"
@@ -333,4 +339,4 @@ def _gains(folder: Folder) -> str:
     gains = folder.scenario.laws.get(folder.law)
     tuning = folder.scenario.tuning.get(folder.law)
     found = f"<p>{escape(tuning)}</p>" if tuning else ""
-    return found + _pairs(_flat(gains)) if gains else found
+    return found + pairs(_flat(gains)) if gains else found
