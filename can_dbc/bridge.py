@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 import can
@@ -30,14 +31,26 @@ class Passed:
     left_out: int = 0  # error frames, and those of CAN FD
 
 
+@contextmanager
+def held(bus: can.BusABC) -> Iterator[can.BusABC]:
+    """The bus, until it is shut down: an adapter that is gone cannot be told so."""
+    try:
+        yield bus
+    finally:
+        with suppress(Exception):  # vendors' drivers raise what they like
+            bus.shutdown()
+
+
 def relay(
     wire: can.BusABC,
     hub: can.BusABC,
     stopped: Callable[[], bool],
     passed: Passed,
+    names: tuple[str, str],
 ) -> None:
     """Pass frames on in both directions until `stopped` says so, and count them in `passed`.
 
+    :param names: of the two buses, for errors.
     :raises BusError: one of the buses is gone, or takes nothing; the text names which.
     """
     failures: queue.Queue[BusError] = queue.Queue()
@@ -59,7 +72,7 @@ def relay(
                 setattr(passed, count, getattr(passed, count) + 1)
         except Exception as error:  # vendors' drivers raise what they like
             reason = " ".join(str(error).split()) or type(error).__name__
-            failures.put(BusError(f"{at.channel_info}: {reason}"))
+            failures.put(BusError(f"{names[at is hub]}: {reason}"))
             over.set()
 
     threads = [

@@ -6,7 +6,7 @@ import time
 import can
 import pytest
 
-from ato_hil.can_dbc.bridge import Passed, relay
+from ato_hil.can_dbc.bridge import Passed, held, relay
 from ato_hil.can_dbc.bus import BusError, open_bus
 
 pytestmark = pytest.mark.usefixtures("runtime_dir")
@@ -22,7 +22,7 @@ class Bridge:
 
     def run(self, wire, hub):
         try:
-            relay(wire, hub, self.over.is_set, self.passed)
+            relay(wire, hub, self.over.is_set, self.passed, ("slcan:tty", "hub:bridged"))
         except BusError as error:
             self.error = error
 
@@ -76,8 +76,6 @@ def test_frames_pass_in_order_both_ways_and_none_comes_back():
 
 def test_an_adapter_that_is_pulled_out_ends_the_bridge_and_is_named():
     class Pulled(can.BusABC):
-        channel_info = "serial adapter"
-
         def __init__(self):
             super().__init__("x")
 
@@ -86,7 +84,11 @@ def test_an_adapter_that_is_pulled_out_ends_the_bridge_and_is_named():
 
         def send(self, msg, timeout=None): ...
 
-    with Pulled() as wire, open_bus("hub:bridged") as hub:
+        def shutdown(self):
+            super().shutdown()
+            raise can.CanOperationError("Could not write to serial device")
+
+    with held(Pulled()) as wire, open_bus("hub:bridged") as hub:
         bridge = Bridge(wire, hub)
         bridge.thread.join(10)
-        assert str(bridge.error).startswith("serial adapter: device reports readiness")
+        assert str(bridge.error).startswith("slcan:tty: device reports readiness")

@@ -98,7 +98,7 @@ def bridge(
 ) -> None:
     """Hold an adapter that only one process can open, and serve it to all nodes as hub:NAME."""
     with one_line_for_bad_input(), ExitStack() as opened:
-        from ato_hil.can_dbc.bridge import Passed, relay
+        from ato_hil.can_dbc.bridge import Passed, held, relay
         from ato_hil.can_dbc.bus import BusError, choose_bus, open_bus
 
         if choose_bus(hub).interface != "atohub":
@@ -106,12 +106,12 @@ def bridge(
         if choose_bus(adapter).interface == "atohub":
             raise BusError(f"bus {adapter!r}: expected an adapter, not another hub")
         settings = {} if bitrate is None else {"bitrate": bitrate}
-        wire = opened.enter_context(open_bus(adapter, **settings))
+        wire = opened.enter_context(held(open_bus(adapter, **settings)))
         nodes = opened.enter_context(open_bus(hub))
         say(f"{adapter} is {hub} until Ctrl-C; a session joins with --bus {hub}")
         passed = Passed()
         try:
-            relay(wire, nodes, lambda: False, passed)
+            relay(wire, nodes, lambda: False, passed, (adapter, hub))
         except BusError as error:
             raise fail(str(error), EXIT_ENDED_EARLY) from None
         except KeyboardInterrupt:
