@@ -18,10 +18,13 @@ class Usual(NamedTuple):
     why: str  # with source
 
 
-LAG = Usual(0.0, 5.0, "s", "a UIC brake in position P fills in 3 to 5 s (UIC 540)")
-MASS = Usual(5e3, 1e8, "kg", "a railbus has 10 t, the heaviest train there was 99,700 t (2001)")
+LAG = Usual(
+    0.0, 10.0, "s", "a brake in position G fills in 18 to 30 s, three time constants (UIC 540)"
+)
+MASS = Usual(5e3, 1e8, "kg", "a railbus has 10 t, the heaviest train had 99,734 t (BHP, 2001)")
 FORCE = Usual(0.05, 3.0, "m/s^2", "steel wheels grip with about 0.3 of their weight")
-JERK = Usual(0.0, 5.0, "m/s^3", "riders accept up to 0.3 g/s, 2.9 (Hoberock 1977)")
+# The survey that 0.3 g/s is quoted from says itself that it draws no firm limit.
+JERK = Usual(0.0, 5.0, "m/s^3", "0.3 g/s, 2.9, is quoted as most for riders (Hoberock 1977)")
 SPEED = Usual(0.0, 160.0, "m/s", "the fastest on wheels were 574.8 km/h (TGV V150, 2007)")
 SPACING = Usual(20.0, np.inf, "m", "a train is longer")
 

@@ -6,9 +6,11 @@ import os
 import platform
 import shutil
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+LITTLE_ROOM = 20e6  # bytes: a run of subway with its trace
 VULKAN_DRIVERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
 
 
@@ -36,6 +38,8 @@ def examine() -> list[Finding]:
         _microcontroller(),
         _limits(),
         _locks(),
+        _disks(),
+        _output(),
     ]
 
 
@@ -211,6 +215,29 @@ def _limits() -> Finding:
     if size != float("inf"):
         texts.append(f"files end at {size / 1e6:g} MB (ulimit -f), traces and recordings as well")
     return Finding(what, "works", "; ".join(texts) or "address space, files, descriptors suffice")
+
+
+def _disks() -> Finding:
+    """Room for results in this folder, and for what processes hand each other."""
+    what, texts = "disks", []
+    for name, folder in (("this folder", "."), ("temporary files", tempfile.gettempdir())):
+        room = shutil.disk_usage(folder).free
+        texts.append(f"{room / 1e9:.3g} GB for {name}")
+        if room < LITTLE_ROOM:
+            text = f"no more than {room / 1e6:.3g} MB for {name} ({folder})"
+            return Finding(what, "broken", f"{text}: make room, or take another folder")
+    return Finding(what, "works", ", ".join(texts))
+
+
+def _output() -> Finding:
+    """What of the texts this terminal, file or pipe can show."""
+    encoding = getattr(sys.stdout, "encoding", None) or "ascii"
+    text = f"texts are written as {encoding}"
+    try:
+        "µ².…".encode(encoding)
+    except UnicodeEncodeError:
+        text += ": characters that it has not become question marks; set LC_ALL=C.UTF-8"
+    return Finding("output", "works", text)
 
 
 def _locks() -> Finding:

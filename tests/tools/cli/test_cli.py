@@ -88,9 +88,14 @@ def test_a_command_that_is_a_slip_away_is_suggested() -> None:
 def test_doctor_finds_this_machine_fit(ato_hil, tmp_path: Path) -> None:
     done = ato_hil("doctor", cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
-    for what in ("compiler", "compiler cache", "DBC", "bus hub", "bus socketcan:vcan0", "viewer"):
+    for what in ("compiler", "DBC", "bus hub", "bus socketcan:vcan0", "viewer", "disks", "output"):
         assert what in done.stdout
     assert "broken" not in done.stdout
+
+
+def test_doctor_names_an_output_that_lacks_characters(ato_hil, tmp_path: Path) -> None:
+    done = ato_hil("doctor", cwd=tmp_path, PYTHONIOENCODING="ascii")
+    assert "texts are written as ascii: characters that it has not" in " ".join(done.stdout.split())
 
 
 def test_compare_lays_laws_side_by_side(ato_hil, short_text, tmp_path: Path) -> None:
