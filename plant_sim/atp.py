@@ -19,11 +19,21 @@ permitted + `margin_m_s`.
     d_EBI(V)   = d_EBD(V_bec) - D_bec
     d_SBI2     = d_EBI - V T_bs2,   d_SBI1 = d_SBD(V) - V T_bs1
     d_W        = d_SBI - V T_warning,   d_P = d_SBI - V T_driver   (of either SBI)
+    d_I        = d_P - V (max(0.8 T_bs, 5 s) + T_driver)
+    A_safe     = K_dry (K_wet + M_NVAVADH (1 - K_wet)) A_brake_emergency   all by speed, or
+                 `safe_share` of A_brake_emergency
+    A_gradient = g grad / (1 + rotating mass);   T_be = Kt_int times the emergency brake's
 
 Feet: a lower static speed has EBD through V_target + dV_ebi(V_target) at its start; the end of
 authority has SBD through 0, the supervised location (`overlap_m` behind it) EBD through 0. No curve
 of a lower static speed goes below V_target + dV of its kind (permitted: V_target), so the
-max(V, V_target) of the standard never acts. Ceiling: V_MRSP, and above it its dV_warning, dV_sbi,
+max(V, V_target) of the standard never acts. Guidance, an option: the permitted speed also keeps
+below the curve of the normal service brake, through V_target where EBD's permitted speed has come
+down to it, or through the end of authority. Release speed, an option:
+near the end of authority no curve but EBD goes below it, and from where SBI has come down to it on
+EBI is there too; beyond that end nothing is permitted, the emergency brake comes (train trip).
+"computed": from EBI of the supervised location at the end of authority, so that a train which trips
+there stops before the supervised location. Ceiling: V_MRSP, and above it its dV_warning, dV_sbi,
 dV_ebi.
 
 Formulas and fixed values were checked against two open implementations: cesarBLG/ETCS
@@ -34,8 +44,9 @@ What is ours, all on the safe side: A_1 and A_2 are not estimated while driving,
 largest that train and track can give (with traction; without), so that curves depend on the
 position alone and hold against any controller. T_cut_off, T_be and T_bs have one control period
 added, which passes before a crossing is seen. The gradient is the most downhill anywhere under the
-train; the resistance of the train does not count. Left out: curves for limits over time, release
-speed, guidance curve, indication.
+train; the resistance of the train does not count. While a brake builds up, the gradient acts
+through A_2, the steepest downhill's. Left out: curves for limits over time, K_n of the guidance
+curve.
 
 What holds, then, whatever the controller does: the train stops before the supervised location, and
 is nowhere above that location's EBD. At a ceiling, and near a lower static speed, the emergency
@@ -53,14 +64,14 @@ All curves are tables that are made once, `atp_tables`.
 from __future__ import annotations
 
 import itertools
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 
 from ato_hil.can_dbc.codec import values
 from ato_hil.can_dbc.step import int64, step
-from ato_hil.plant_sim.brakes import Brake, Step
+from ato_hil.plant_sim.brakes import Brake, Speed, Step
 from ato_hil.plant_sim.track import section_at
 
 NONE, MARGIN, ETCS = 0, 1, 2
@@ -73,7 +84,8 @@ NORMAL, WARNING, SERVICE_BRAKE, EMERGENCY_BRAKE = values(
 )
 # The curves.
 EBD, EBI, SBI, WARN, PERMITTED = 0, 1, 2, 3, 4
-CURVES = 5
+INDICATION = 5
+CURVES = 6
 
 KM_H = 1 / 3.6
 STANDSTILL_M_S = 0.01
@@ -85,6 +97,9 @@ SpeedMargin = Annotated[float, msgspec.Meta(ge=0, le=20)]
 Seconds = Annotated[float, msgspec.Meta(ge=0, le=60)]
 Acceleration = Annotated[float, msgspec.Meta(ge=0, le=10)]
 Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
+Part = Annotated[float, msgspec.Meta(ge=0, le=1)]
+UnderReading = Annotated[float, msgspec.Meta(ge=0, le=0.2)]
+BuildUpFactor = Annotated[float, msgspec.Meta(ge=1, le=5)]
 Ticks = Annotated[int, msgspec.Meta(ge=1, le=10_000)]
 
 
@@ -93,6 +108,13 @@ class StaticSpeed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     until_m: Place  # position up to which it holds
     speed_m_s: PositiveSpeed  # the limit
+
+
+class Factor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A factor that holds from a speed on, up to the next one's."""
+
+    above_m_s: Speed = 0.0  # speed from which on it holds
+    share: Share  # the factor
 
 
 class Atp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -121,7 +143,19 @@ class Atp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     warning_cuts_traction: bool = False  # a warning already orders that
     t_warning_s: Seconds = 2.0  # from warning to service brake
     t_driver_s: Seconds = 4.0  # from the permitted speed to the service brake
-    speed_under_reading_m_s: SpeedMargin = 0.0  # V_delta0
+    speed_under_reading_m_s: SpeedMargin = 0.0  # V_delta0, with the next one
+    speed_under_reading_share: UnderReading = 0.0  # the same, of the speed
+    k_dry: list[Factor] = []  # K_dry_rst by speed; none: safe_share
+    k_wet: list[Factor] = []  # K_wet_rst by speed, with k_dry; none: 1
+    available_adhesion: Part = 0.0  # M_NVAVADH: 1 counts on dry rails, 0 on wet ones
+    kt_int: BuildUpFactor = 1.0  # of the emergency brake's build-up time
+    # Rotating mass that a gradient has to move too, of the mass; "unknown": 15 % uphill, 2 % down;
+    # none: the track has it already.
+    rotating_share: Part | Literal["unknown"] | None = None
+    guidance_brake: list[Step] = []  # the normal service brake; none: no guidance curve
+    # Near the end of authority nothing is asked below it; "computed": from the overlap; none: no
+    # release speed.
+    release_speed_m_s: PositiveSpeed | Literal["computed"] | None = None
     # Largest acceleration until traction is off; none: what train and track can give.
     a_1_m_s2: Acceleration | None = None
     # Largest acceleration once traction is off; none: likewise.
@@ -143,6 +177,14 @@ class Atp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
                 f"t_driver_s is {self.t_driver_s:g}, expected t_warning_s or more,"
                 f" {self.t_warning_s:g}"
             )
+        if self.k_wet and not self.k_dry:
+            raise ValueError("k_wet needs k_dry")
+        for name in ("k_dry", "k_wet", "guidance_brake"):
+            above = [row.above_m_s for row in getattr(self, name)]
+            if above and (above[0] != 0.0 or any(b <= a for a, b in itertools.pairwise(above))):
+                raise ValueError(f"{name}: expected above_m_s to rise from 0")
+        if self.release_speed_m_s is not None and self.end_of_authority_m is None:
+            raise ValueError("release_speed_m_s needs end_of_authority_m")
         until = [row.until_m for row in self.speeds]
         if any(b <= a for a, b in itertools.pairwise(until)):
             raise ValueError("speeds: expected until_m to rise")
@@ -292,6 +334,7 @@ def find_ceilings(params: Any, limits: Any, state: Any, tick: Any, position_m: A
     curve[SBI] = np.inf
     curve[EBI] = np.inf
     curve[EBD] = np.inf
+    curve[INDICATION] = np.inf
     if params.supervision == MARGIN:
         curve[WARN] = permitted
         curve[EBI] = permitted + params.margin_m_s
@@ -314,8 +357,10 @@ def find_curves(limits: Any, state: Any, position_m: Any) -> None:
         target = limits.targets[number]
         if position_m >= target.end_m or target.speed_m_s >= ceiling:
             continue
+        speed = curve_speed(limits.knots, target, INDICATION, position_m)
+        curve[INDICATION] = min(curve[INDICATION], speed)
         if position_m >= target.begin_m:
-            for kind in range(CURVES):
+            for kind in range(INDICATION):
                 speed = curve_speed(limits.knots, target, kind, position_m)
                 curve[kind] = min(curve[kind], speed)
                 if kind == PERMITTED and speed < least:

@@ -6,6 +6,10 @@ from)) - offset. With x the place on EBD of V + D_V:
 
     x = d + V T + D_d,   (V + D_V)^2 = v_i^2 - 2 a (x - x_i)   =>
     from = x_i - (v_i - D_V) T - D_d,   square = (v_i + a T)^2,   slope = 2 a,   offset = a T + D_V
+
+With a speed that reads too low by a share u of itself, V (1 + u) stands for V on EBD and in D_bec;
+times after the intervention count at V, as T / (1 + u) at V (1 + u); then all speeds are divided by
+1 + u.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from ato_hil.plant_sim.atp import (
     CURVES,
     EBD,
     EBI,
+    INDICATION,
     KNOT,
     PERMITTED,
     SBI,
@@ -27,17 +32,22 @@ from ato_hil.plant_sim.atp import (
     TARGET,
     WARN,
     Atp,
+    Factor,
     Limits,
     dv_ebi,
     dv_sbi,
     dv_warning,
 )
-from ato_hil.plant_sim.brakes import Brake, ticks_of
+from ato_hil.plant_sim.brakes import Step, ticks_of
 from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 SLOPE_PIECE_M = 20.0  # a gradient that changes counts as constant over so much, its worst
 SPARE_M_S = 1.0  # how far the curves go on above the fastest that ATP lets pass
 LEAST_DECELERATION_M_S2 = 0.05  # on the steepest downhill
+# Rotating mass that counts where it is not known: of the mass, as the standard has it.
+ROTATING_UPHILL, ROTATING_DOWNHILL = 0.15, 0.02
+INDICATION_LEAST_S = 5.0
+SAME_PLACE_M = 1e-6  # a place plus and minus a length may differ from it by rounding
 
 
 class Way(NamedTuple):
@@ -57,10 +67,11 @@ class Times(NamedTuple):
     delta_0: float
     delta_1: float
     delta_2: float
+    reads_low: float = 0.0  # part of the speed by which it reads too low
 
     @property
     def delta_m_s(self) -> float:
-        """V_bec - V."""
+        """V_bec - V, without the part that grows with V."""
         return self.delta_0 + self.delta_1 + self.delta_2
 
     @property
@@ -91,12 +102,52 @@ def times_of(atp: Atp, period_s: float, a_1_m_s2: float, a_2_m_s2: float) -> Tim
     traction = late(atp.traction_cut_off_s)
     if atp.warning_cuts_traction:
         traction = max(traction - (atp.t_warning_s + bs2), 0.0)
-    berem = max(late(atp.emergency_brake.build_up_s) - traction, 0.0)
+    berem = max(late(atp.emergency_brake.build_up_s * atp.kt_int) - traction, 0.0)
     a_1 = a_1_m_s2 if atp.a_1_m_s2 is None else atp.a_1_m_s2
     a_2 = a_2_m_s2 if atp.a_2_m_s2 is None else atp.a_2_m_s2
     return Times(
-        traction, berem, bs1, bs2, atp.speed_under_reading_m_s, a_1 * traction, a_2 * berem
+        traction,
+        berem,
+        bs1,
+        bs2,
+        atp.speed_under_reading_m_s,
+        a_1 * traction,
+        a_2 * berem,
+        atp.speed_under_reading_share,
     )
+
+
+def indication_s(atp: Atp) -> float:
+    """T_indication: from the indication to the permitted speed."""
+    return max(0.8 * atp.service_brake.build_up_s, INDICATION_LEAST_S) + atp.t_driver_s
+
+
+def safe_brake(atp: Atp) -> list[Step]:
+    """What the curves count on of the emergency brake, A_brake_safe by speed."""
+    steps = atp.emergency_brake.steps
+    if not atp.k_dry:
+        return _scaled(steps, atp.safe_share)
+    k_wet = atp.k_wet or [Factor(share=1.0)]
+    speeds = sorted({row.above_m_s for rows in (steps, atp.k_dry, k_wet) for row in rows})
+    safe = []
+    for speed in speeds:
+        dry, wet = _row_at(atp.k_dry, speed).share, _row_at(k_wet, speed).share
+        share = dry * (wet + atp.available_adhesion * (1 - wet))
+        safe.append(
+            Step(above_m_s=speed, deceleration_m_s2=share * _row_at(steps, speed).deceleration_m_s2)
+        )
+    return safe
+
+
+def _scaled(steps: list[Step], share: float) -> list[Step]:
+    return [
+        Step(above_m_s=row.above_m_s, deceleration_m_s2=share * row.deceleration_m_s2)
+        for row in steps
+    ]
+
+
+def _row_at(rows: list[Any], speed_m_s: float) -> Any:
+    return [row for row in rows if row.above_m_s <= speed_m_s][-1]
 
 
 def static_speeds(atp: Atp) -> Way:
@@ -109,9 +160,11 @@ def static_speeds(atp: Atp) -> Way:
     )
 
 
-def gradients(sections: np.ndarray, train_length_m: float) -> Way:
+def gradients(
+    sections: np.ndarray, train_length_m: float, rotating: float | str | None = None
+) -> Way:
     """Deceleration by the track, m/s^2, at its most downhill under a train; `sections` [n] of
-    track.SECTION."""
+    track.SECTION, `rotating` as Atp.rotating_share."""
     from_m: list[float] = []
     values: list[float] = []
     ends = [*sections["from_m"][1:], math.inf]
@@ -128,7 +181,15 @@ def gradients(sections: np.ndarray, train_length_m: float) -> Way:
                 * N_PER_KN
                 * min(float(section["resistance_n_per_kn"]) + slope * each for each in both)
             )
+    if rotating is not None:
+        values = [value / (1 + _rotating(rotating, value)) for value in values]
     return least_behind(Way(from_m, values), train_length_m)
+
+
+def _rotating(share: float | str, deceleration_m_s2: float) -> float:
+    if isinstance(share, str):
+        return ROTATING_UPHILL if deceleration_m_s2 > 0 else ROTATING_DOWNHILL
+    return share
 
 
 def least_behind(way: Way, length_m: float) -> Way:
@@ -141,7 +202,7 @@ def least_behind(way: Way, length_m: float) -> Way:
         value = min(
             value
             for value, first, last in zip(way.values, way.from_m, ends, strict=True)
-            if first < end and last > rear
+            if first < end and last > rear + SAME_PLACE_M
         )
         if not result.values or value != result.values[-1]:
             result.from_m.append(start)
@@ -150,8 +211,7 @@ def least_behind(way: Way, length_m: float) -> Way:
 
 
 def deceleration_curve(
-    brake: Brake,
-    share: float,
+    steps: list[Step],
     gradient: Way,
     foot_m: float,
     foot_m_s: float,
@@ -159,13 +219,13 @@ def deceleration_curve(
     end_m_s: float,
 ) -> list[Point]:
     """EBD or SBD through a foot, from `top_m_s` down to `end_m_s`, by rising position. The
-    deceleration is `share` of the brake's and the gradient's."""
+    deceleration is that of the brake's `steps` and the gradient's."""
     points = []
     x, v = foot_m, foot_m_s
     while v < top_m_s:
-        a = share * _deceleration_above(brake, v) + _value_before(gradient, x)
+        a = _row_at(steps, v).deceleration_m_s2 + _value_before(gradient, x)
         start = max((place for place in gradient.from_m if place < x), default=-math.inf)
-        faster = min((row.above_m_s for row in brake.steps if row.above_m_s > v), default=top_m_s)
+        faster = min((row.above_m_s for row in steps if row.above_m_s > v), default=top_m_s)
         faster = min(faster, top_m_s)
         length = (faster * faster - v * v) / (2 * a)
         if x - length > start:
@@ -176,9 +236,9 @@ def deceleration_curve(
     points.reverse()
     x, v = foot_m, foot_m_s
     while v > end_m_s:
-        a = share * _deceleration_below(brake, v) + _value_after(gradient, x)
+        a = _deceleration_below(steps, v) + _value_after(gradient, x)
         end = min((place for place in gradient.from_m if place > x), default=math.inf)
-        slower = max((row.above_m_s for row in brake.steps if row.above_m_s < v), default=0.0)
+        slower = max((row.above_m_s for row in steps if row.above_m_s < v), default=0.0)
         slower = max(slower, end_m_s)
         length = (v * v - slower * slower) / (2 * a)
         points.append(Point(x, v, a))
@@ -190,13 +250,8 @@ def deceleration_curve(
     return points
 
 
-def _deceleration_above(brake: Brake, speed_m_s: float) -> float:
-    rows = [row for row in brake.steps if row.above_m_s <= speed_m_s]
-    return rows[-1].deceleration_m_s2
-
-
-def _deceleration_below(brake: Brake, speed_m_s: float) -> float:
-    rows = [row for row in brake.steps if row.above_m_s < speed_m_s]
+def _deceleration_below(steps: list[Step], speed_m_s: float) -> float:
+    rows = [row for row in steps if row.above_m_s < speed_m_s]
     return rows[-1].deceleration_m_s2
 
 
@@ -220,18 +275,25 @@ def position_of(points: list[Point], speed_m_s: float) -> float:
 
 
 def knots_of(
-    points: list[Point], time_s: float, delta_m_s: float, distance_m: float
+    points: list[Point], time_s: float, delta_m_s: float, distance_m: float, reads_low: float = 0.0
 ) -> list[tuple[float, float, float, float]]:
     """KNOT rows of the curve that lies V `time_s` + `distance_m` before a deceleration curve, at
-    speeds lower by `delta_m_s`; then 0."""
+    speeds lower by `delta_m_s`, all then divided by 1 + `reads_low`; then 0."""
+    scale = 1.0 + reads_low
     rows = []
     for x, v, a in points:
         start = x - (v - delta_m_s) * time_s - distance_m
         offset = a * time_s + delta_m_s
-        root = v + a * time_s
-        rows.append((start, root * root, 2 * a, offset))
+        root = (v + a * time_s) / scale
+        rows.append((start, root * root, 2 * a / (scale * scale), offset / scale))
     rows[-1] = (rows[-1][0], 0.0, 0.0, 0.0)
     return rows
+
+
+def speed_at(rows: list[tuple[float, float, float, float]], position_m: float) -> float:
+    """Speed of a curve's KNOT rows at a position, 0 at least."""
+    start, square, slope, offset = [row for row in rows if row[0] <= position_m][-1]
+    return max(math.sqrt(max(square - slope * (position_m - start), 0.0)) - offset, 0.0)
 
 
 class _Tables:
@@ -276,8 +338,9 @@ def supervised(
     if atp.supervision == "etcs":
         delays = times_of(atp, period_s, a_1_m_s2, a_2_m_s2)
         fastest = min(max(static.values), float(times["speed_m_s"].max()))
-        top_m_s = fastest + dv_ebi(fastest) + delays.delta_m_s + a_1_m_s2 * period_s + SPARE_M_S
-        gradient = gradients(sections, atp.train_length_m)
+        fastest = (fastest + dv_ebi(fastest)) * (1.0 + delays.reads_low)
+        top_m_s = fastest + delays.delta_m_s + a_1_m_s2 * period_s + SPARE_M_S
+        gradient = gradients(sections, atp.train_length_m, atp.rotating_share)
         for before, after, place in zip(
             static.values, static.values[1:], static.from_m[1:], strict=False
         ):
@@ -292,22 +355,51 @@ def _emergency_curves(
     atp: Atp, delays: Times, points: list[Point]
 ) -> dict[int, list[tuple[float, float, float, float]]]:
     """The curves that follow from EBD."""
+    low = 1.0 + delays.reads_low
     built_up_s = delays.traction + delays.berem
-    margin = delays.delta_m_s, delays.d_bec_m
+    service_s = built_up_s + delays.bs2 / low
+    margin = delays.delta_m_s, delays.d_bec_m, delays.reads_low
     return {
         EBD: knots_of(points, 0.0, 0.0, 0.0),
         EBI: knots_of(points, built_up_s, *margin),
-        SBI: knots_of(points, built_up_s + delays.bs2, *margin),
-        WARN: knots_of(points, built_up_s + delays.bs2 + atp.t_warning_s, *margin),
-        PERMITTED: knots_of(points, built_up_s + delays.bs2 + atp.t_driver_s, *margin),
+        SBI: knots_of(points, service_s, *margin),
+        WARN: knots_of(points, service_s + atp.t_warning_s / low, *margin),
+        PERMITTED: knots_of(points, service_s + atp.t_driver_s / low, *margin),
+        INDICATION: knots_of(
+            points, service_s + (atp.t_driver_s + indication_s(atp)) / low, *margin
+        ),
     }
 
 
-def _reach_m(atp: Atp, delays: Times, points: list[Point], speed_m_s: float) -> float:
-    """Where the permitted speed of EBD has come down to a speed."""
-    time_s = delays.traction + delays.berem + delays.bs2 + atp.t_driver_s
-    at_m = position_of(points, speed_m_s + delays.delta_m_s)
-    return at_m - speed_m_s * time_s - delays.d_bec_m
+def _reach_m(
+    delays: Times, points: list[Point], speed_m_s: float, before_service_s: float
+) -> float:
+    """Where a curve of EBD, so long before the service brake, has come down to a speed."""
+    time_s = delays.traction + delays.berem + delays.bs2 + before_service_s
+    more_m_s = speed_m_s * delays.reads_low
+    at_m = position_of(points, speed_m_s + more_m_s + delays.delta_m_s)
+    more_m = more_m_s * (delays.traction + delays.berem)
+    return at_m - speed_m_s * time_s - delays.d_bec_m - more_m
+
+
+def _add_guidance(
+    made: _Tables,
+    atp: Atp,
+    gradient: Way,
+    end_m: float,
+    foot_m: float,
+    speed_m_s: float,
+    floor_m_s: float,
+    top_m_s: float,
+) -> None:
+    """The permitted speed of the guidance curve, if there is one."""
+    if not atp.guidance_brake:
+        return
+    points = deceleration_curve(atp.guidance_brake, gradient, foot_m, speed_m_s, top_m_s, speed_m_s)
+    made.add(
+        end_m, speed_m_s, foot_m, {PERMITTED: floor_m_s},
+        {PERMITTED: knots_of(points, 0.0, 0.0, 0.0)},
+    )  # fmt: skip
 
 
 def _add_lower_speed(
@@ -320,50 +412,86 @@ def _add_lower_speed(
     top_m_s: float,
 ) -> None:
     foot_m_s = speed_m_s + dv_ebi(speed_m_s)
-    points = deceleration_curve(
-        atp.emergency_brake, atp.safe_share, gradient, place_m, foot_m_s, top_m_s, speed_m_s
-    )
+    points = deceleration_curve(safe_brake(atp), gradient, place_m, foot_m_s, top_m_s, speed_m_s)
     floors = {
         PERMITTED: speed_m_s,
         WARN: speed_m_s + dv_warning(speed_m_s),
         SBI: speed_m_s + dv_sbi(speed_m_s),
         EBI: speed_m_s + dv_ebi(speed_m_s),
+        INDICATION: speed_m_s,
     }
-    reach_m = min(_reach_m(atp, delays, points, speed_m_s), place_m)
+    reach_m = min(_reach_m(delays, points, speed_m_s, atp.t_driver_s), place_m)
     made.add(place_m, speed_m_s, reach_m, floors, _emergency_curves(atp, delays, points))
+    _add_guidance(made, atp, gradient, place_m, reach_m, speed_m_s, speed_m_s, top_m_s)
 
 
 def _add_authority(
     made: _Tables, atp: Atp, delays: Times, gradient: Way, end_m: float, top_m_s: float
 ) -> None:
-    service = deceleration_curve(atp.service_brake, 1.0, gradient, end_m, 0.0, top_m_s, 0.0)
+    service = deceleration_curve(atp.service_brake.steps, gradient, end_m, 0.0, top_m_s, 0.0)
+    supervised_m = end_m + atp.overlap_m
+    emergency = deceleration_curve(safe_brake(atp), gradient, supervised_m, 0.0, top_m_s, 0.0)
+    curves = _emergency_curves(atp, delays, emergency)
+    release_m_s = atp.release_speed_m_s
+    if release_m_s == "computed":
+        release_m_s = speed_at(curves[EBI], end_m)
+    until_m, floors = math.inf, dict[int, float]()
+    if isinstance(release_m_s, float) and release_m_s > 0.0:
+        until_m = end_m
+        floors = dict.fromkeys((PERMITTED, WARN, SBI, EBI, INDICATION), release_m_s)
+    permitted_s = delays.bs1 + atp.t_driver_s
     made.add(
-        math.inf,
+        until_m,
         0.0,
         end_m,
-        {},
+        floors,
         {
             SBI: knots_of(service, delays.bs1, 0.0, 0.0),
             WARN: knots_of(service, delays.bs1 + atp.t_warning_s, 0.0, 0.0),
-            PERMITTED: knots_of(service, delays.bs1 + atp.t_driver_s, 0.0, 0.0),
+            PERMITTED: knots_of(service, permitted_s, 0.0, 0.0),
+            INDICATION: knots_of(service, permitted_s + indication_s(atp), 0.0, 0.0),
         },
     )
-    emergency = deceleration_curve(
-        atp.emergency_brake, atp.safe_share, gradient, end_m + atp.overlap_m, 0.0, top_m_s, 0.0
+    made.add(until_m, 0.0, _reach_m(delays, emergency, 0.0, atp.t_driver_s), floors, curves)
+    if floors:
+        _add_release(made, delays, end_m, floors[PERMITTED], service, emergency)
+    floor_m_s = floors.get(PERMITTED, 0.0)
+    _add_guidance(made, atp, gradient, until_m, end_m, 0.0, floor_m_s, top_m_s)
+
+
+def _add_release(
+    made: _Tables,
+    delays: Times,
+    end_m: float,
+    release_m_s: float,
+    service: list[Point],
+    emergency: list[Point],
+) -> None:
+    """From where SBI has come down to the release speed on, that speed is all; beyond the end of
+    authority the train is tripped."""
+    from_m = min(
+        position_of(service, release_m_s) - release_m_s * delays.bs1,
+        _reach_m(delays, emergency, release_m_s, 0.0),
     )
-    reach_m = _reach_m(atp, delays, emergency, 0.0)
-    made.add(math.inf, 0.0, reach_m, {}, _emergency_curves(atp, delays, emergency))
+    kinds = (PERMITTED, WARN, SBI, EBI)
+    row = (min(from_m, end_m), release_m_s * release_m_s, 0.0, 0.0)
+    tripped = (end_m, 0.0, 0.0, 0.0)
+    made.add(end_m, 0.0, end_m, {}, {kind: [row] for kind in kinds})
+    made.add(math.inf, 0.0, end_m, {}, {kind: [tripped] for kind in kinds})
 
 
 def braking_fault(atp: Atp, sections: np.ndarray) -> str:
     """What is wrong with the brakes on this track [n] of track.SECTION, "" for nothing."""
     if atp.supervision != "etcs":
         return ""
-    steepest = -min(gradients(sections, atp.train_length_m).values)
-    for key, weakest in (
-        ("emergency_brake", atp.safe_share * atp.emergency_brake.weakest_m_s2),
-        ("service_brake", atp.service_brake.weakest_m_s2),
+    steepest = -min(gradients(sections, atp.train_length_m, atp.rotating_share).values)
+    guidance = [("guidance_brake", atp.guidance_brake)] if atp.guidance_brake else []
+    for key, steps in (
+        ("emergency_brake", safe_brake(atp)),
+        ("service_brake", atp.service_brake.steps),
+        *guidance,
     ):
+        weakest = min(row.deceleration_m_s2 for row in steps)
         if weakest - steepest < LEAST_DECELERATION_M_S2:
             return (
                 f"atp.{key}: {weakest:g} m/s^2 does not hold the train on the steepest downhill,"

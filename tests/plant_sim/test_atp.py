@@ -271,7 +271,7 @@ def test_the_curves_are_in_order_and_only_a_higher_static_speed_raises_them(spee
     last = None
     for position in np.arange(0.0, 1650.0, 3.0):
         curves = supervised.curves(float(position))
-        permitted, warning, service, emergency, ebd = curves[::-1]
+        _, permitted, warning, service, emergency, ebd = curves[::-1]
         assert permitted <= warning <= service <= emergency
         assert emergency <= ebd + 1e-9 or ebd == np.inf
         if last is not None and not any(position - 3.0 < rise <= position for rise in rises):
