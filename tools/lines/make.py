@@ -197,6 +197,7 @@ def scenario_text(line: Line, train: Train, run: Run, law: str, objective: str, 
             )
         ),
         "]",
+        *_braking(line, train),
         "",
         "[control]",
         f"preview_ticks = {round(late_s / PERIOD_S)}  # what delay and lag make late",
@@ -219,6 +220,29 @@ def scenario_text(line: Line, train: Train, run: Run, law: str, objective: str, 
         lines += ["", f"# {rule}", f"[laws.{name}]"]
         lines += [f"{key} = {_toml(value)}" for key, value in values.items()]
     return "\n".join(lines) + "\n"
+
+
+def _braking(line: Line, train: Train) -> list[str]:
+    """Rows of [atp] for the brakes that ETCS counts on."""
+    known = train.etcs
+    if known is None:
+        return []
+
+    def brake(steps: list[tuple[float, float]], build_up_s: float) -> str:
+        rows = (f"{{ above_m_s = {_n(v)}, deceleration_m_s2 = {_n(a)} }}" for v, a in steps)
+        return f"{{ steps = [{', '.join(rows)}], build_up_s = {_n(build_up_s)} }}"
+
+    return [
+        '# The braking data of the train for ETCS; with supervision = "etcs" it makes the curves.',
+        f"emergency_brake = {brake(known.emergency, known.emergency_build_up_s)}",
+        f"service_brake = {brake(known.service, known.service_build_up_s)}",
+        f"k_dry = [{{ share = {_n(known.k_dry)} }}]",
+        f"k_wet = [{{ share = {_n(known.k_wet)} }}]",
+        f"available_adhesion = {_n(line.available_adhesion)}",
+        f"kt_int = {_n(line.kt_int)}",
+        f"traction_cut_off_s = {_n(known.traction_cut_off_s)}",
+        f"speed_under_reading_share = {_n(known.reads_low_share)}",
+    ]
 
 
 def least_time_s(line: Line, train: Train, first: int, last: int) -> float:

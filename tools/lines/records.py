@@ -18,6 +18,20 @@ class LineError(InputError):
     """A file of a line or train is wrong; the message names file, field and what was expected."""
 
 
+class Braking(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What ETCS has to know of a train's brakes; each list of steps is [from, value], the first
+    from 0."""
+
+    emergency: list[tuple[float, float]]  # m/s, m/s^2
+    service: list[tuple[float, float]]
+    k_dry: Share = 1.0
+    k_wet: Share = 1.0
+    traction_cut_off_s: NotNegative = 0.0
+    emergency_build_up_s: NotNegative = 0.0
+    service_build_up_s: NotNegative = 0.0
+    reads_low_share: Share = 0.0  # by which the speed may read too low
+
+
 class Train(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A train; also the keys of a train.toml."""
 
@@ -38,6 +52,7 @@ class Train(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     resistance_n_s2_m2: NotNegative = 0.0
     traction_efficiency: Share = 1.0
     brake_efficiency: Share = 0.0
+    etcs: Braking | None = None  # none: not known
 
 
 class Tunnel(msgspec.Struct, frozen=True):
@@ -58,6 +73,8 @@ class Line(msgspec.Struct, frozen=True, kw_only=True):
     curves: list[tuple[float, float, float]] = []  # from, 1/m at its start and at its end
     tunnels: list[Tunnel] = []
     altitude_m: float = 0.0
+    available_adhesion: float = 0.0  # M_NVAVADH
+    kt_int: float = 1.0
 
 
 def check_stops(where: str, stops: list[float]) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from ato_hil.tools.lines.records import (
+    Braking,
     Line,
     LineError,
     Train,
@@ -57,6 +58,16 @@ TRAIN_FIELDS = {
 }
 
 
+BRAKING_FIELDS = {
+    "K_dry_rst": ("k_dry", SHARE),
+    "K_wet_rst": ("k_wet", SHARE),
+    "T_traction": ("traction_cut_off_s", TIME),
+    "T_be": ("emergency_build_up_s", TIME),
+    "T_bs": ("service_build_up_s", TIME),
+    "v_uncertainty": ("reads_low_share", SHARE),
+}
+
+
 def read_train(path: Path) -> Train:
     """A TRAIN.json. Raises LineError with file, field and what was expected."""
     content = _content(path)
@@ -64,6 +75,8 @@ def read_train(path: Path) -> Train:
     for field, (key, units) in TRAIN_FIELDS.items():
         if field in content:
             values[key] = _value(path, field, content[field], units)
+    if "ETCS braking data" in content:
+        values["etcs"] = _braking(path, content)
     names = {key: field for field, (key, _) in TRAIN_FIELDS.items()}
     try:
         return msgspec.convert(values, Train)
@@ -72,6 +85,31 @@ def read_train(path: Path) -> Train:
         for key, field in names.items():
             text = text.replace(f"`{key}`", f"`{field}`").replace(f"$.{key}`", f"{field}`")
         raise LineError(f"{path}: {text}") from None
+
+
+def _braking(path: Path, content: dict[str, Any]) -> Braking:
+    entry = _field(path, "ETCS braking data", content)
+
+    def steps(field: str) -> list[tuple[float, float]]:
+        columns = {"velocity": SPEED, "deceleration": ACCELERATION}
+        rows = _table(path, field, entry, columns)
+        where = f"{path}: field '{field}'"
+        if not rows or rows[0][0] != 0.0 or any(b[0] <= a[0] for a, b in itertools.pairwise(rows)):
+            raise LineError(f"{where}: expected velocities that rise from 0")
+        if not all(value > 0 for _, value in rows):
+            raise LineError(f"{where}: expected decelerations above 0")
+        return [(speed, value) for speed, value in rows]
+
+    found: dict[str, Any] = {
+        "emergency": steps("A_brake_emergency"), "service": steps("A_brake_service")
+    }  # fmt: skip
+    for field, (key, units) in BRAKING_FIELDS.items():
+        if field in entry:
+            found[key] = _value(path, field, entry[field], units)
+            most = 1.0 if units is SHARE else 60.0
+            if not 0 <= found[key] <= most:
+                raise LineError(f"{path}: field '{field}': expected 0 to {most:g}")
+    return Braking(**found)
 
 
 def read_line(path: Path) -> Line:
@@ -106,6 +144,17 @@ def read_line(path: Path) -> Line:
         tunnels = _table(path, "tunnels", content, columns)
         check_rising(f"{path}: field 'tunnels'", [row[0] for row in tunnels])
     altitude = content.get("altitude")
+    adhesion, kt_int = 0.0, 1.0
+    if "ETCS braking data" in content:
+        entry = _field(path, "ETCS braking data", content)
+        if "M_NVAVADH" in entry:
+            adhesion = _value(path, "M_NVAVADH", entry["M_NVAVADH"], SHARE)
+        if "Kt_int" in entry:
+            kt_int = _value(path, "Kt_int", entry["Kt_int"], SHARE)
+        if not (0 <= adhesion <= 1 and 1 <= kt_int <= 5):
+            raise LineError(
+                f"{path}: field 'ETCS braking data': expected M_NVAVADH 0 to 1, Kt_int 1 to 5"
+            )
     return Line(
         name=_name(path, content),
         stops_m=stops,
@@ -114,6 +163,8 @@ def read_line(path: Path) -> Line:
         curves=[(at, 1 / abs(first), 1 / abs(last)) for at, first, last in curves],
         tunnels=[Tunnel(*row) for row in tunnels],
         altitude_m=0.0 if altitude is None else _value(path, "altitude", altitude, LENGTH),
+        available_adhesion=adhesion,
+        kt_int=kt_int,
     )
 
 

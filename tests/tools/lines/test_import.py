@@ -70,6 +70,61 @@ def folder(tmp_path):
     return tmp_path
 
 
+ETCS_TRAIN = {
+    "A_brake_emergency": {
+        "units": {"velocity": "km/h", "deceleration": "m/s^2"}, "values": [[0, 1.1], [36, 1.0]],
+    },
+    "A_brake_service": {
+        "units": {"velocity": "m/s", "deceleration": "m/s^2"}, "values": [[0, 0.7]],
+    },
+    "K_dry_rst": {"unit": "-", "value": 0.8},
+    "K_wet_rst": {"unit": "%", "value": 90},
+    "T_traction": {"unit": "s", "value": 1},
+    "T_be": {"unit": "s", "value": 4},
+    "T_bs": {"unit": "s", "value": 3},
+    "v_uncertainty": {"unit": "%", "value": 2.98},
+}  # fmt: skip
+ETCS_TRACK = {"M_NVAVADH": {"unit": "-", "value": 0.5}, "Kt_int": {"unit": "-", "value": 1.15}}
+
+
+def test_braking_data_become_what_atp_counts_on(folder):
+    (folder / "train.json").write_text(json.dumps(TRAIN | {"ETCS braking data": ETCS_TRAIN}))
+    (folder / "track.json").write_text(json.dumps(TRACK | {"ETCS braking data": ETCS_TRACK}))
+    line = ttobench.read_line(folder / "track.json")
+    train = ttobench.read_train(folder / "train.json")
+    text = make.scenario_text(line, train, make.Run(0, 1, None), "cailc", "time", "")
+    path = folder / "it.toml"
+    path.write_text(text.replace('supervision = "margin"', 'supervision = "etcs"'))
+    known = load(str(path)).scenario.atp
+    assert [(r.above_m_s, r.deceleration_m_s2) for r in known.emergency_brake.steps] == [
+        (0.0, 1.1), (10.0, 1.0),
+    ]  # fmt: skip
+    assert known.emergency_brake.build_up_s == 4.0
+    assert known.service_brake.build_up_s == 3.0
+    assert (known.k_dry[0].share, known.k_wet[0].share) == (0.8, pytest.approx(0.9))
+    assert (known.available_adhesion, known.kt_int) == (0.5, 1.15)
+    assert (known.traction_cut_off_s, known.speed_under_reading_share) == (
+        1.0, pytest.approx(0.0298),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [
+        ("A_brake_service", ETCS_TRAIN["A_brake_service"] | {"values": [[5, 0.7]]}, "rise from 0"),
+        ("A_brake_service", ETCS_TRAIN["A_brake_service"] | {"values": [[0, 0]]}, "above 0"),
+        ("K_dry_rst", {"unit": "-", "value": 1.2}, "field 'K_dry_rst': expected 0 to 1"),
+        ("T_be", {"unit": "m", "value": 4}, "field 'T_be': unit 'm', expected one of"),
+    ],
+)
+def test_wrong_braking_data_are_refused_in_one_line(folder, field, value, expected):
+    wrong = TRAIN | {"ETCS braking data": ETCS_TRAIN | {field: value}}
+    (folder / "train.json").write_text(json.dumps(wrong))
+    with pytest.raises(LineError, match=expected) as error:
+        ttobench.read_train(folder / "train.json")
+    assert "\n" not in str(error.value)
+
+
 def test_units_are_read_not_assumed(folder):
     line = ttobench.read_line(folder / "track.json")
     assert line.stops_m == [0.0, 600.0, 1400.0]
