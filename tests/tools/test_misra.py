@@ -42,6 +42,7 @@ def unlisted(made: dict[str, str], at: Path) -> list[str]:
 
 
 @needs_cppcheck
+@pytest.mark.long
 def test_every_deviation_of_an_export_is_listed(tmp_path: Path) -> None:
     made = folder.files("subway", "pid")
     assert unlisted(made, tmp_path) == []

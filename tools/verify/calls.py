@@ -40,7 +40,7 @@ RECEIVED = (
     TRAIN_SPEED,
     TRAIN_POSITION,
 )
-VARIANTS = 3  # of a calibration, in drive.c
+VARIANTS = 4  # of a calibration, in drive.c
 RUN_TICKS = 70  # of an adversarial run
 DATA_BITS = 48  # of a frame, behind its end-to-end header
 

@@ -73,6 +73,9 @@ static result drive(const int64_t *words, size_t count, int variant)
     if (variant == 2) {
         params.reference.segment_count = 1;
     }
+    if (variant == 3) {
+        params.guard.atp_releases = 1;
+    }
     ato_init(&params, &state, cells);
     while (at + 1 < count) {
         int64_t period = words[at];
