@@ -54,7 +54,7 @@ def _find(configured: tuple[str, ...], home: str) -> Path | None:
         if not reason:
             return folder
         refused.append(f"{folder}: {reason}")
-    temporary = _temporary()
+    temporary = temporary_folder()
     because = "; ".join(refused) or "there is no home"
     if temporary is None:
         _LOG.warning("ato-hil: compiled code cannot be kept, each start compiles: %s", because)
@@ -72,7 +72,7 @@ def _wanted(configured: tuple[str, ...], home: str) -> Iterator[Path]:
         yield Path(home) / ".cache" / "ato-hil"
 
 
-def _temporary() -> Path | None:
+def temporary_folder() -> Path | None:
     """A folder that only this user can enter, among the temporary files."""
     with contextlib.suppress(OSError):
         ours = Path(tempfile.gettempdir(), f"ato-hil-{os.getuid()}")

@@ -20,6 +20,8 @@ from rich.console import Console
 from rich.status import Status
 from rich.text import Text
 
+from ato_hil.can_dbc.cache import temporary_folder
+
 WIDTH_OF_FILES = 150  # tables for files and pipes: wide enough not to wrap
 _STANDARD = {0: "stdin", 1: "stdout", 2: "stderr"}
 # Of other tools, and of no use here: they turn off what we ask for, or fail.
@@ -149,3 +151,6 @@ def ignore_other_tools() -> None:
             warnings.simplefilter("ignore", category)
     for name in _FOREIGN:
         os.environ.pop(name, None)
+    # Matplotlib would make a home that is not there, and whatever leads to it.
+    if not os.path.isdir(os.path.expanduser("~")) and (folder := temporary_folder()) is not None:
+        os.environ.setdefault("MPLCONFIGDIR", str(folder))

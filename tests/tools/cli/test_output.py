@@ -144,6 +144,20 @@ def test_variables_of_other_programs_are_ignored(monkeypatch: pytest.MonkeyPatch
     assert not {"RERUN", "MPLBACKEND"} & os.environ.keys()
 
 
+def test_a_home_that_is_not_there_is_not_made(tmp_path: Path) -> None:
+    home = tmp_path / "not" / "there"
+    environment = {name: value for name, value in os.environ.items() if "CACHE" not in name}
+    environment.pop("MPLCONFIGDIR", None)
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "ato_hil", "--help"],
+        env={**environment, "HOME": str(home), "TMPDIR": str(tmp_path)},
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0
+    assert not home.parent.exists()
+
+
 def test_figures_take_nothing_of_the_users_matplotlibrc() -> None:
     with matplotlib.rc_context({"text.usetex": True, "lines.linewidth": 9.0}):
         _figure, (axes,) = style.panels()
