@@ -190,8 +190,8 @@ def read(path: Path) -> Campaign:
     try:
         file = msgspec.convert(content, File)
     except msgspec.ValidationError as error:
-        text, place = validation(error, File)
-        where = f"key {place.lstrip('.')}: " if place else ""
+        key, text = validation(error, File)
+        where = f"key {key}: " if key else ""
         raise CampaignError(f"{path}: {where}{text}") from None
     _check(path, file)
     files: dict[str, str] = {}
