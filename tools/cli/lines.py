@@ -42,22 +42,25 @@ def import_line(
     ] = None,
     times: Annotated[
         str | None,
-        typer.Option(help="Running times from stop to stop, s: 190,108,... The first are enough."),
+        typer.Option(
+            help="Running times from stop to stop, s: 190,108,... A section without one takes 1.1"
+            " times the least."
+        ),
     ] = None,
+    dwell: Annotated[
+        float, typer.Option(min=0, max=3600, help="How long it stands at a stop, s.")
+    ] = 30.0,
     from_stop: Annotated[
         int, typer.Option("--from", min=1, help="Stop it starts at, 1 first.")
     ] = 1,
     to_stop: Annotated[
         int | None,
-        typer.Option("--to", min=2, help="Stop it ends at; the next. It passes those between."),
+        typer.Option("--to", min=2, help="Stop it ends at; the last."),
     ] = None,
     objective: Annotated[Objective, typer.Option(help="What the plan saves.")] = Objective.energy,
     law: Annotated[str, typer.Option(help="Default law of the scenario.")] = "pid-feedforward",
 ) -> None:
-    """Make a scenario of a line, a train and a timetable: a run from stop to stop.
-
-    Without a time the run takes 1.1 times the least one.
-    """
+    """Make a scenario of a line, a train and a timetable: a service with all stops."""
     with one_line_for_bad_input():
         from ato_hil.tools.lines import make, read
 
@@ -67,23 +70,25 @@ def import_line(
             raise fail(f"--out {out}: is there already", EXIT_BAD_INPUT)
         line, source = read.line(track, stops, limits, gradients)
         vehicle = read.train(train)
-        line, given = read.timetable(line, journey, times)
-        last = from_stop + 1 if to_stop is None else to_stop
+        line, given, dwells = read.timetable(line, journey, times, dwell)
+        last = len(line.stops_m) if to_stop is None else to_stop
         read.check_stops(line, from_stop, last)
         first, last = from_stop - 1, last - 1
-        if objective is Objective.time:
-            duration_s = None
-        elif given:
-            duration_s = read.duration_s(given, first, last)
-        else:
-            duration_s = float(math.ceil(1.1 * make.least_time_s(line, vehicle, first, last)))
-        run = make.Run(first, last, duration_s)
+        run_s = None if objective is Objective.time else given[first:last]
+        if run_s is not None and len(run_s) < last - first:
+            free = make.least_times_s(line, vehicle, first + len(run_s), last)
+            run_s += [float(math.ceil(1.1 * least_s)) for least_s in free]
+        if run_s is not None:
+            run_s = read.whole(run_s, make.PERIOD_S)
+        dwells = read.whole(dwells[first : last - 1], make.PERIOD_S)
+        run = make.Run(first, last, run_s, dwells)
         text = make.scenario_text(line, vehicle, run, law, objective.value, source)
         make.check(out, text)
         make.write(out, text)
     length_m = line.stops_m[last] - line.stops_m[first]
-    timed = "in least time" if duration_s is None else f"in {duration_s:g} s"
-    say(f"{out}: {length_m:g} m {timed}; next: ato-hil run {out} --mode sil")
+    timed = "in least time" if run_s is None else f"in {sum(run_s) + sum(dwells):g} s"
+    say(f"{out}: {length_m:g} m, {last - first + 1} stops, {timed}")
+    say(f"next: ato-hil run {out} --mode sil")
     if any(tunnel.from_m < line.stops_m[last] for tunnel in line.tunnels):
         say("tunnels are left out: their air drag is not simulated")
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 
 from ato_hil.plant_sim.planner import PlanError
+from ato_hil.plant_sim.running import road
 from ato_hil.plant_sim.scenario import Scenario, planned
+from ato_hil.plant_sim.service import plan_service
+from ato_hil.plant_sim.trains import point
 from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 from ato_hil.tools.lines import gains
 from ato_hil.tools.lines.records import Line, LineError, Train
@@ -28,12 +32,16 @@ MAP_SECTIONS_MAX = 127  # of the onboard gradient map, its last row ends it
 CURVE_PIECE_M = 20.0  # a transition curve in steps
 
 
+FIRST_DWELL_S, LAST_DWELL_S = 5.0, 10.0
+
+
 class Run(NamedTuple):
-    """One run of the line: from stop to stop."""
+    """A service on the line, with all stops from one to another."""
 
     first: int  # numbers of the stops, 0 first
     last: int
-    duration_s: float | None  # none: the least time
+    times_s: list[float] | None  # from stop to stop; none: the least times
+    dwells_s: list[float]  # at the stops between
 
 
 def resistance_steps(line: Line, share: float) -> list[tuple[float, float]]:
@@ -77,8 +85,9 @@ def scenario_text(line: Line, train: Train, run: Run, law: str, objective: str, 
     start, end = line.stops_m[run.first], line.stops_m[run.last]
     if end - start > 65000:
         raise LineError(
-            f"{line.name}: {end - start:g} m from stop to stop, expected up to 65000 m,"
-            " what a position of the firmware holds"
+            f"{line.name}: {end - start:g} m from stop {run.first + 1} to stop {run.last + 1},"
+            " expected up to 65000 m, what a position of the firmware holds: import it in parts,"
+            " with --from and --to"
         )
     inertia_kg = train.mass_kg * (1 + train.rotating_share)
     steps = _from_start(resistance_steps(line, 1 / (1 + train.rotating_share)), start, end, train)
@@ -158,15 +167,15 @@ def scenario_text(line: Line, train: Train, run: Run, law: str, objective: str, 
         "",
         "[profile]",
         f'objective = "{objective}"  # or "{"time" if objective == "energy" else "energy"}"'
-        + (", which takes no duration_s" if objective == "energy" else ", which needs duration_s"),
-        *([f"duration_s = {_n(run.duration_s)}"] if objective == "energy" else []),
-        f"distance_m = {_n(round(end - start, 6))}",
+        + (", which takes no run_s" if objective == "energy" else ", which needs a run_s a stop"),
         f"max_speed_m_s = {_n(train.max_speed_m_s)}",
         f"max_acceleration_m_s2 = {_n(acceleration)}",
         f"max_deceleration_m_s2 = {_n(deceleration)}",
         f"max_jerk_m_s3 = {JERK_M_S3}",
         "force_share = 0.9  # of traction and brake; the rest is for control",
         f"margin_m_s = {MARGIN_M_S}  # below the limits of the line",
+        "# A stop each: running time from the one before, and how long the train stands.",
+        *_stops(line, run),
         "",
         "[sensors]",
         "position_step_m = 0.001",
@@ -208,6 +217,7 @@ def scenario_text(line: Line, train: Train, run: Run, law: str, objective: str, 
         ),
         "",
         "[control.guard]",
+        "hold_brake_m_s2 = 0.5  # at the stops",
         "brake_margin_m_s = 1.0  # above the limit",
         "emergency_margin_m_s = 2.0",
         "",
@@ -245,11 +255,26 @@ def _braking(line: Line, train: Train) -> list[str]:
     ]
 
 
-def least_time_s(line: Line, train: Train, first: int, last: int) -> float:
-    """What the run takes at least, with its margins. Raises PlanError."""
-    text = scenario_text(line, train, Run(first, last, None), gains.LAWS[0], "time", "")
+def least_times_s(line: Line, train: Train, first: int, last: int) -> list[float]:
+    """What each section takes at least, with its margins. Raises PlanError."""
+    run = Run(first, last, None, [0.0] * (last - first - 1))
+    text = scenario_text(line, train, run, gains.LAWS[0], "time", "")
     scenario = msgspec.convert(tomllib.loads(text), Scenario)
-    return float(planned(scenario)["ticks"].sum()) * PERIOD_S
+    assert isinstance(scenario.train, point.Train)
+    way = road(scenario.track, scenario.atp)
+    _table, calls = plan_service(scenario.profile, PERIOD_S, scenario.train, way)
+    return [(b.arrival - a.departure) * PERIOD_S for a, b in pairwise(calls)]
+
+
+def _stops(line: Line, run: Run) -> list[str]:
+    """The stops of a service, as the scenario has them."""
+    dwells = [FIRST_DWELL_S, *run.dwells_s, LAST_DWELL_S]
+    lines = ["stops = ["]
+    for number, dwell_s in enumerate(dwells):
+        at = line.stops_m[run.first + number] - line.stops_m[run.first]
+        timed = f"run_s = {_n(run.times_s[number - 1])}, " if number and run.times_s else ""
+        lines.append(f"    {{ position_m = {_n(round(at, 6))}, {timed}dwell_s = {_n(dwell_s)} }},")
+    return [*lines, "]"]
 
 
 def _from_start(

@@ -30,18 +30,22 @@ def train(path: Path) -> Train:
     return tables.read_train(path) if path.suffix == ".toml" else ttobench.read_train(path)
 
 
-def timetable(line: Line, journey: Path | None, times: str | None) -> tuple[Line, list[float]]:
-    """The line with the stops of the timetable, and the running times between them, none: free.
+def timetable(
+    line: Line, journey: Path | None, times: str | None, dwell_s: float
+) -> tuple[Line, list[float], list[float]]:
+    """The line with the stops of the timetable, the running times between them as far as they are
+    given, and how long it stands at each stop but the first and the last.
 
     Raises LineError.
     """
     if journey is not None and times is not None:
         raise LineError("expected --journey or --times, not both")
     if journey is not None:
-        stops, found = ttobench.read_journey(journey, line)
-        return msgspec.structs.replace(line, stops_m=stops), found
+        stops, found, dwells = ttobench.read_journey(journey, line)
+        return msgspec.structs.replace(line, stops_m=stops), found, dwells
+    dwells = [dwell_s] * (len(line.stops_m) - 2)
     if times is None:
-        return line, []
+        return line, [], dwells
     found = []
     for text in times.split(","):
         try:
@@ -56,7 +60,7 @@ def timetable(line: Line, journey: Path | None, times: str | None) -> tuple[Line
             f"--times: {len(found)} times, expected up to {len(line.stops_m) - 1},"
             " one from stop to stop"
         )
-    return line, found
+    return line, found, dwells
 
 
 def check_stops(line: Line, first: int, last: int) -> None:
@@ -68,8 +72,6 @@ def check_stops(line: Line, first: int, last: int) -> None:
         )
 
 
-def duration_s(times: list[float], first: int, last: int) -> float:
-    """What the timetable has from a stop to another, 0 first. Raises LineError."""
-    if last > len(times):
-        raise LineError(f"--times: {len(times)} times, expected one up to stop {last + 1}")
-    return sum(times[first:last])
+def whole(times: list[float], period_s: float) -> list[float]:
+    """Times as whole control periods."""
+    return [round(round(time / period_s) * period_s, 6) for time in times]

@@ -168,8 +168,9 @@ def read_line(path: Path) -> Line:
     )
 
 
-def read_journey(path: Path, line: Line) -> tuple[list[float], list[float]]:
-    """Stops of a JOURNEY.json, m, and the running times between them, s.
+def read_journey(path: Path, line: Line) -> tuple[list[float], list[float], list[float]]:
+    """Stops of a JOURNEY.json, m, the running times between them, s, and how long it stands at
+    those between the first and the last, s.
 
     It stops where both its speeds are 0; a time is from the earliest departure to the earliest
     arrival that it allows. Raises LineError, also if the journey is another line's.
@@ -198,7 +199,7 @@ def read_journey(path: Path, line: Line) -> tuple[list[float], list[float]]:
         if not arrival > departure:
             raise LineError(f"{where}: expected times at which it leaves {start:g} m, then stops")
         times.append(arrival - departure)
-    return stops, times
+    return stops, times, [max(halts[at][-1] - halts[at][0], 0.0) for at in stops[1:-1]]
 
 
 def _content(path: Path) -> dict[str, Any]:

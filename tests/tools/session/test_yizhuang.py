@@ -10,10 +10,10 @@ from ato_hil.plant_sim.scenario import load
 PART = "yizhuang@5-6"
 
 
-def test_a_part_of_the_service_over_the_bus_has_the_digest_of_sil():
+def test_a_part_of_the_service_over_the_bus_has_the_digest_of_sil(tmp_path):
     digests = {
         ato_hil.simulate(PART, runs=1, mode=mode, **more).complete().digest
-        for mode, more in (("sil", {}), ("hil", {"bus": "hub"}))
+        for mode, more in (("sil", {}), ("hil", {"bus": f"hub:{tmp_path.name[-20:]}"}))
     }
     assert len(digests) == 1
 
@@ -25,10 +25,10 @@ def test_a_part_of_the_service_interpreted_has_the_digest_of_sil():
 
 
 @pytest.mark.long
-def test_the_whole_service_over_the_bus_has_the_digest_of_sil():
+def test_the_whole_service_over_the_bus_has_the_digest_of_sil(tmp_path):
     digests = {
         ato_hil.simulate("yizhuang", runs=2, mode=mode, **more).complete().digest
-        for mode, more in (("sil", {}), ("hil", {"bus": "hub"}))
+        for mode, more in (("sil", {}), ("hil", {"bus": f"hub:{tmp_path.name[-20:]}"}))
     }
     assert len(digests) == 1
 
