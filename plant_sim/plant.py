@@ -470,3 +470,52 @@ def build(model: Any) -> tuple[Any, Any, Any]:
             own.node.tick += 1
 
     return begin, sense, actuate_and_advance
+
+
+def build_around(model: Any, host: Any) -> tuple[Any, Any, Any]:
+    """The same of a line of one around a train that moves in another process: trains.foreign."""
+    reset_train, command_train, push, settle = (
+        model.reset,
+        model.command,
+        model.push,
+        model.settle,
+    )
+
+    @step
+    def prepare(params: Any, state: Any) -> None:
+        begin_equipment(params[0], state[0])
+        reset_train(params[0].train, state[0].train)
+
+    @step
+    def before(params: Any, state: Any, tick: Any, rx: Any, truth: Any) -> None:
+        setting = params[0]
+        own = state[0]
+        row = truth[0, tick]
+        read_train(setting, own, rx[0], row)
+        command_train(setting, own)
+        act_train(setting, own)
+        push(setting.train, own.train, setting.actuator, own.actuator)
+        row.force_n = own.train.force_n
+        row.coupler_force_n = 0.0
+
+    @step
+    def after(params: Any, state: Any) -> None:
+        settle(params[0].train, state[0].train)
+        state[0].node.tick += 1
+
+    def begin(params: Any, state: Any) -> None:
+        prepare(params, state)
+        host.reset(state[0]["train"])
+        after(params, state)
+        state["node"]["tick"] = 0
+        for name in ("acceleration_m_s2", "traction_j", "braking_j"):
+            state["train"][name] = 0.0
+
+    def actuate_and_advance(
+        params: Any, _track: Any, state: Any, _chance: Any, tick: Any, rx: Any, truth: Any
+    ) -> None:
+        before(params, state, tick, rx, truth)
+        host.exchange(state[0]["train"])
+        after(params, state)
+
+    return begin, sense, actuate_and_advance

@@ -38,6 +38,7 @@ from ato_hil.can_dbc.fault_receiver import receiver_of
 from ato_hil.can_dbc.faults import PLANT
 from ato_hil.can_dbc.inbox import Inbox, fresh_frames, intact
 from ato_hil.plant_sim import failures, plant, world
+from ato_hil.plant_sim.fmi.process import FmuError
 from ato_hil.plant_sim.scenario import ScenarioError, load
 
 TICK_START = FORCE_CMD.Tick.start
@@ -367,6 +368,7 @@ def one_run(
         **({} if spin_ns is None else {"timing": str(timing_file)}),
         faults=faults,
         refused=sum(int(state["node"]["refused"]) for state in here.state),
+        repeats=here.repeats(),
     )
 
 
@@ -402,7 +404,7 @@ def main() -> int:
         ports = [
             port_of(here, train, bus, arguments.faults, fails) for train, bus in enumerate(buses)
         ]
-    except (ScenarioError, BusError) as error:
+    except (ScenarioError, BusError, FmuError) as error:
         opened.close()
         tell("error", message=str(error))
         return 1
@@ -425,6 +427,9 @@ def main() -> int:
     except SilentNode as error:
         tell("error", message=str(error))
         return 3
+    except FmuError as error:
+        tell("error", message=str(error))
+        return 1
     except can.CanError as error:
         names = ", ".join(arguments.bus)
         tell("error", message=f"plant: bus {names} is gone: {error}")

@@ -43,7 +43,7 @@ from ato_hil.plant_sim.profile import (
 )
 from ato_hil.plant_sim.running import plan_running, road
 from ato_hil.plant_sim.track import Track, known, sections
-from ato_hil.plant_sim.trains import couplers, lumped, point
+from ato_hil.plant_sim.trains import couplers, foreign, lumped, point
 
 FOLDER = Path(__file__).with_name("scenarios")
 # The train models; key `train.model` chooses. Each file has a Train, PARAMS, STATE, calibrate, and
@@ -52,8 +52,9 @@ MODELS: dict[type, ModuleType] = {
     lumped.Train: lumped,
     couplers.Train: couplers,
     point.Train: point,
+    foreign.Train: foreign,
 }
-AnyTrain = lumped.Train | couplers.Train | point.Train
+AnyTrain = lumped.Train | couplers.Train | point.Train | foreign.Train
 
 RUNS_MAX = 4095  # numbers that RUN_CTRL carries
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
@@ -640,6 +641,19 @@ def _check(path: str, scenario: Scenario, under: str = "") -> None:
         key = "interpolation" if scenario.track.interpolation != "hold" else "averaged_over_m"
         model = "only train model 'point' takes such a track"
         raise ScenarioError(f"{path}: key {under}track.{key}: {model}")
+    if isinstance(scenario.train, foreign.Train):
+        by_car = isinstance(scenario.train.force, list)
+        for key, wrong in (
+            ("control.distribute", by_car and not scenario.control.distribute),
+            ("disturbance", scenario.disturbance.amplitude_m_s2 > 0),
+            ("changes", bool(scenario.changes)),
+            ("start", scenario.start != Start()),
+        ):
+            if wrong:
+                expected_ = "true" if key.endswith("distribute") else "none"
+                raise ScenarioError(
+                    f"{path}: key {under}{key}: with train model 'fmu', expected {expected_}"
+                )
     if scenario.line and not isinstance(scenario.train, point.Train):
         raise ScenarioError(f"{path}: key {under}train.model: a line has trains of model 'point'")
     if any(b.from_run <= a.from_run for a, b in pairwise(scenario.changes)):

@@ -34,7 +34,7 @@ from ato_hil.plant_sim.scenario import (
     in_run,
     members,
 )
-from ato_hil.plant_sim.trains import couplers, point
+from ato_hil.plant_sim.trains import couplers, foreign, point
 from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 # Chance: what a random number is drawn for; each gets a stream of its own, in each train.
@@ -61,9 +61,14 @@ class World:
     state: Any  # [trains]
     limits: atp.Limits
     track: Any  # [n] of track.SECTION
+    host: foreign.Host | None  # of a train that moves in another process
     rx: Any  # [trains, MESSAGE_COUNT] mailboxes
     tx: Any
     fails: Sequence[failures.AnyFailure]  # beside the faults of the scenario's line
+
+    def repeats(self) -> bool:
+        """Whether the train of this run, if it is foreign, moves the same once more."""
+        return self.host is None or self.host.repeats()
 
     def ticks(self, run: int) -> int:
         """Control periods of a run."""
@@ -96,7 +101,12 @@ def build(loaded: Loaded, seed: int, fails: Sequence[failures.AnyFailure] = ()) 
     scenario = loaded.scenario
     model = MODELS[type(scenario.train)]
     trains = members(loaded)
-    begin, sense, actuate_and_advance = plant.build(model)
+    host = None
+    if isinstance(scenario.train, foreign.Train):
+        host = foreign.Host(scenario.train, loaded.path.parent, scenario.period_s)
+        begin, sense, actuate_and_advance = plant.build_around(model, host)
+    else:
+        begin, sense, actuate_and_advance = plant.build(model)
     params = np.zeros(len(trains), plant.params_dtype(model.PARAMS))
     for train in trains:
         params[train.train] = _params(train, model, fails)[0]
@@ -113,6 +123,7 @@ def build(loaded: Loaded, seed: int, fails: Sequence[failures.AnyFailure] = ()) 
         state=rows(np.zeros(len(trains), plant.state_dtype(model.STATE))),
         limits=supervised(loaded),
         track=rows(track.sections(scenario.track)),
+        host=host,
         rx=rows(np.zeros(boxes, MAILBOX)),
         tx=rows(np.zeros(boxes, MAILBOX)),
         fails=fails,

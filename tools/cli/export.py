@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli.console import one_line_for_bad_input, say
+from ato_hil.tools.cli.console import EXIT_BAD_INPUT, fail, one_line_for_bad_input, say
 from ato_hil.tools.cli.options import DEFAULT_BOARD, BoardName
 from ato_hil.tools.session import boards
 
@@ -78,18 +78,24 @@ def fmu_command(
     plant: Annotated[
         bool, typer.Option("--plant", help="The plant instead: train, track, ATP and sensors.")
     ] = False,
+    train: Annotated[
+        bool, typer.Option("--train", help="The bare train instead: forces in, motion out.")
+    ] = False,
     bus: Annotated[
         FmuBus,
         typer.Option(help="can: FMI-LS-BUS 1.0; none: signals of the frames are variables."),
     ] = FmuBus.can,
 ) -> None:
-    """The controller as an FMU (FMI 3.0 Co-Simulation) with its C and a binary, or the plant."""
+    """The controller as an FMU (FMI 3.0 Co-Simulation) with its C and a binary; or the plant."""
     with one_line_for_bad_input():
         from ato_hil.plant_sim.scenario import load
         from ato_hil.tools.export.fmu import archive, controller
         from ato_hil.tools.export.fmu import plant as plant_fmu
+        from ato_hil.tools.export.fmu import train as train_fmu
 
-        part = plant_fmu if plant else controller
+        if plant and train:
+            raise fail("--plant has the train in it, so not with --train", EXIT_BAD_INPUT)
+        part = plant_fmu if plant else train_fmu if train else controller
         made = part.unpacked(load(scenario), law, bus.value)
         missing = archive.write(made, out)
     say(f"{out}: {len(made.interface.variables)} variables; {missing or 'with a binary'}")

@@ -378,7 +378,7 @@ def _print_end(summary: dict[str, Any], options: Options) -> None:
         _print_target(summary["target"])
     if "timing" in summary:
         _print_timing(summary["timing"])
-    repeats = "" if summary["digest_repeats"] else "   (in real time another one each time)"
+    repeats = "" if summary["digest_repeats"] else "   (another one each time)"
     say(f"digest  {summary['digest']}{repeats}")
     say(f"summary {folder / 'summary.json'}")
     if options.trace:

@@ -174,6 +174,11 @@ def array_types(program: Program) -> list[str]:
     return [*_arrays(program, list(_tuple(program))), *_several(program)]
 
 
+def row_types(program: Program) -> list[str]:
+    """Types of the arrays that know their lengths, and of the tuples that steps return."""
+    return [*_arrays(program, []), *_several(program)]
+
+
 def _arrays(program: Program, behind: list[str]) -> Iterator[str]:
     for name, (dtype, dimensions) in program.counted.items():
         yield "typedef struct {"

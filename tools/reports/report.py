@@ -290,7 +290,7 @@ def _again(folder: Folder) -> str:
     command += " --faults FAULTS.toml" if faults else ""
     outcome = "gives the same digest."
     if not summary.get("digest_repeats", True):
-        outcome = "runs it again; in real time the digest is another one each time."
+        outcome = "runs it again; the digest is another one each time."
     if folder.rows and folder.rows[0]["run"] > 1:
         learned = folder.rows[0]["run"] - 1
         outcome += f" It takes the learning memory after run {learned}, too (--memory)."

@@ -40,6 +40,7 @@ class Run:
     punctuality: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))
     timing: np.ndarray | None = None  # of a run in real time: realtime.table
     recorded: dict[str, Any] | None = None  # the row of summary.json that was read from there
+    repeats: bool = True  # a train that is an FMU has moved the same when asked once more
     missing: str = ""  # why there are neither frames nor truths
 
     @property

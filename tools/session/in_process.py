@@ -12,9 +12,10 @@ from ato_hil.can_dbc import faults
 from ato_hil.controller.node import Controller
 from ato_hil.plant_sim.failures import AnyFailure
 from ato_hil.plant_sim.scenario import Loaded, members
+from ato_hil.plant_sim.trains import foreign
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.result import Run
-from ato_hil.tools.session import sil, sil_faults
+from ato_hil.tools.session import fmus, pil, sil, sil_faults
 
 Progress = Callable[[int, int], None]
 
@@ -59,6 +60,10 @@ def drive(
 ) -> Iterator[Run]:
     """The same with controllers that the caller has built: one compiled loop, or frame by frame
     where a plan of faults comes between; `fails` is what fails in the plant then."""
+    if plan is None and isinstance(loaded.scenario.train, foreign.Train):
+        ours = [fmus.OurController(node) for node in nodes]
+        law = nodes[0].calibration.law
+        return pil.run_line(loaded, law, ours, runs=numbers, seed=seed, progress=progress)
     if plan is None:
         return sil.run_line(loaded, nodes, runs=numbers, seed=seed, progress=progress)
     return sil_faults.run_line(

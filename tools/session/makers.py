@@ -80,7 +80,10 @@ class InProcess:
 
     def _next(self, made: Generator[Run, None, None]) -> Run | None:
         with self.interrupts.let_through():
-            return next(made, None)
+            try:
+                return next(made, None)
+            except FmuError as error:  # what was good when it was checked
+                raise processes.RunError(str(error)) from None
 
     def tell(self, run: Run) -> None:
         """Frames and facts to the writer."""

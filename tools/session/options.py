@@ -18,6 +18,7 @@ from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.registry import load_law
 from ato_hil.plant_sim import failures
 from ato_hil.plant_sim.scenario import Loaded, load, members
+from ato_hil.plant_sim.trains import foreign
 from ato_hil.tools.runs import can_logs, limits, locks, onboard
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
 from ato_hil.tools.session import boards, processes
@@ -197,6 +198,10 @@ def check(options: Options, held: ExitStack) -> Setup:
     law, calibrations, runs = _controllers(options, trains)
     if runs[-1] > RUNS_MAX:
         raise SessionError(f"run {runs[-1]} is the last, expected at most {RUNS_MAX}")
+    if isinstance(loaded.scenario.train, foreign.Train):
+        if options.mode == "mil":
+            raise SessionError(f"{loaded.path}: a train that is an FMU needs another mode than mil")
+        foreign.Host(loaded.scenario.train, loaded.path.parent, loaded.scenario.period_s)
     if options.record is not None:
         can_logs.check_target(options.record)
         held.enter_context(locks.file_held(options.record))

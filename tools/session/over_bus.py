@@ -221,6 +221,7 @@ class OverBus:
             memory=self._memory(number) if setup.words else None,
             punctuality=punctuality,
             timing=timing,
+            repeats=led.get("repeats", True),
         )
 
     def _check(self, led: dict[str, Any], heard: dict[str, Any]) -> int:

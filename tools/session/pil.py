@@ -18,11 +18,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Protocol
 
 import numpy as np
 
@@ -94,6 +94,19 @@ class State:
     faults: int
     stack_bytes: int  # ever used
     systick_most: int  # of a control period
+
+
+class Driven(Protocol):
+    """A controller outside of the plant's loop: a board, an FMU, or ours."""
+
+    def send(self, period: int, mailboxes: Any, /) -> None:
+        """The fresh mailboxes, for a call of ato_cycle."""
+
+    def receive(self, mailboxes: Any, /) -> None:
+        """What came of it, into mailboxes that are stale."""
+
+    def state(self) -> Any:
+        """What became of it so far: `faults`."""
 
 
 class Target:
@@ -294,7 +307,7 @@ def _digest(calibration: Calibration) -> int:
 def run_line(
     loaded: Loaded,
     law: str,
-    started: list[Target],
+    started: Sequence[Driven],
     *,
     runs: range,
     seed: int,
@@ -321,12 +334,13 @@ def run_line(
         if progress:
             progress(number, truth.shape[1])
         sent = [of_train[:count] for of_train, count in zip(frames, counts, strict=True)]
-        yield made.add(number, sent, list(truth), faults, seconds)
+        repeats = here.repeats()
+        yield made.add(number, sent, list(truth), faults, seconds, repeats=repeats)
 
 
 def _drive(
     here: world.World,
-    started: list[Target],
+    started: Sequence[Driven],
     run: int,
     chance: Any,
     truth: np.ndarray,
@@ -360,7 +374,7 @@ def _drive(
     return counts
 
 
-def _announce(here: world.World, started: list[Target], run_state: int, run: int) -> None:
+def _announce(here: world.World, started: Sequence[Driven], run_state: int, run: int) -> None:
     """RUN_CTRL outside a run, and the controllers' answers."""
     for train, target in enumerate(started):
         sil.clear(here.tx[train])

@@ -200,6 +200,12 @@ class Session:
             raise RunError(run.cut)
         if recording is not None:
             recording.add(run.number, run.frames[0])
+        if not run.repeats and self.summary["digest_repeats"]:
+            self.summary["digest_repeats"] = False
+            self.listener.note(
+                f"run {run.number}: the train is not deterministic: the same forces move it"
+                " otherwise the second time"
+            )
         row = run.row
         if row["max_position_error_m"] is None:
             self.listener.note(
