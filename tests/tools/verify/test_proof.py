@@ -46,6 +46,7 @@ def test_without_frama_c_nothing_is_said_to_be_proved(monkeypatch: pytest.Monkey
     ]
 
 
+@pytest.mark.long
 @needs_frama_c
 def test_a_learning_law_keeps_its_bounds_whatever_is_in_state_memory_and_mailboxes(
     tmp_path: Path,
