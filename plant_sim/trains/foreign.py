@@ -45,8 +45,8 @@ class Train(
     start_m: float = 0.0  # what is added to its position
     effectiveness: list[Positive] = []  # of each car: force at the train per newton asked for
     motor_cars: list[int] = []  # 1-based
-    traction_max_n: list[float] = []
-    brake_max_n: list[float] = []
+    traction_max_n: list[float] = []  # what each car can give; none: as much as CAR_FORCE carries
+    brake_max_n: list[float] = []  # likewise, braking
     # Steps of the FMU in a control period.
     substeps: Annotated[int, msgspec.Meta(ge=1, le=STEPS_MAX)] = 5
     rear_offset_m = 0.0
