@@ -1,4 +1,4 @@
-"""Paper 4 through the whole chain (SIL): what is claimed, what holds, what must be seen to fail.
+"""Paper 4 through the whole chain (SIL): what its table of claims does not say (test_claims.py).
 
 Gain sets: LIT are the paper's in wide bounds, LITT in physical ones, MIN those with a useful
 Gamma_w on the memory's grid, REV the default. RMS errors are over 0 to 2400 s, which every run
@@ -25,13 +25,17 @@ from ato_hil.tools.papers.afilc.claims import (
     LAG,
     POSITION,
     SPEED,
+    boxed,
     falls_to,
     force_budget_m_s2,
     history,
     largest,
     last_ten,
+    least,
     of,
     overspeed_bound_km_h,
+    paper,
+    rev,
     stretched,
 )
 from ato_hil.tools.papers.claims import variant
@@ -48,7 +52,6 @@ LIT, LITT, MIN, REV = (
 U_0 = {
     "0": "[laws.p-ilc]\nfeedforward = false\nresistance = [0.0, 0.0, 0.0]\n",
     "h": "[laws.p-ilc]\nresistance = [0.0, 0.0, 0.0]\n",
-    "h and resistance": "",
 }
 
 
@@ -145,13 +148,11 @@ def test_the_first_runs_learn_as_fast_as_the_spec_s():
 
 @pytest.mark.long
 @pytest.mark.parametrize("u_0", U_0)
-def test_the_baseline_exceeds_the_speed_limit_and_gets_lost(u_0):
-    """Run 1 plays u_0, run 2 the first learned input: 398 km/h above the profile."""
+def test_the_baseline_exceeds_the_speed_limit_whatever_it_starts_from(u_0):
+    """Run 1 plays u_0, run 2 the first learned input. With h and resistance: the table."""
     runs = of(LIT, U_0[u_0], law="p-ilc", count=3)
     assert runs["overspeed_km_h"][0] < 2  # C6 holds for the first learned input only
     assert runs["overspeed_km_h"][1] > 2
-    if u_0 == "h and resistance":
-        assert runs[POSITION].max() / runs[POSITION][0] > 3  # 11.8
 
 
 @pytest.mark.long
@@ -169,43 +170,40 @@ def test_the_guard_holds_the_baseline():
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("base", "text", "position", "speed", "tail_m", "overspeed_km_h", "step_m_s2"),
-    [(REV, IDEAL, 0.05, 0.25, 0.02, 1.0, 0.002), (MIN, "", 0.03, 0.40, 0.01, 0.6, 0.005)],
-    ids=["REV", "MIN"],
+    ("learned", "step_m_s2"), [(rev, 0.002), (least, 0.005)], ids=["REV", "MIN"]
 )
-def test_errors_fall_within_all_constraints(
-    base, text, position, speed, tail_m, overspeed_km_h, step_m_s2
-):
-    runs = of(base, text)
-    assert falls_to(runs, POSITION) <= position
-    assert falls_to(runs, SPEED) <= speed
-    assert last_ten(runs, "tail_rms_m") <= tail_m
-    assert largest(runs, "overspeed_km_h") <= overspeed_km_h
-    assert largest(runs, "force_ratio") <= 0.65
-    assert largest(runs, "clipped") == 0
-    assert largest(runs, "barrier_ratio") < 1
+def test_the_command_stays_smooth_and_no_run_has_a_fault(learned, step_m_s2):
+    runs = learned()
     assert runs["force_step_m_s2"][-1] <= step_m_s2
     assert largest(runs, "faults") == 0
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("base", "position", "speed", "overspeed_km_h"),
-    [(REV, 0.05, 0.30, 1.1), (MIN, 0.03, 0.65, 0.6)],  # .024 .166 .702, .014 .50 .29
-    ids=["REV", "MIN"],
-)
-def test_errors_fall_with_all_imperfections(base, position, speed, overspeed_km_h):
-    runs = of(base) if base == REV else of(base, FAULTS)
-    assert falls_to(runs, POSITION) <= position
-    assert falls_to(runs, SPEED) <= speed
-    assert largest(runs, "overspeed_km_h") <= overspeed_km_h
+def test_the_paper_s_gains_with_a_useful_gamma_w_keep_the_constraints():
+    runs = least()
+    assert last_ten(runs, "tail_rms_m") <= 0.01
     assert largest(runs, "force_ratio") <= 0.65
+    assert largest(runs, "barrier_ratio") <= 1
+
+
+@pytest.mark.long
+def test_errors_fall_with_all_imperfections():
+    """MIN; measured .014 .50 .29."""
+    runs = of(MIN, FAULTS)
+    assert falls_to(runs, POSITION) <= 0.03
+    assert falls_to(runs, SPEED) <= 0.65
+    assert largest(runs, "overspeed_km_h") <= 0.6
+    assert largest(runs, "force_ratio") <= 0.65
+
+
+@pytest.mark.long
+def test_the_default_gains_have_force_to_spare_with_all_imperfections():
+    assert largest(of(REV), "force_ratio") <= 0.65
 
 
 @pytest.mark.long
 def test_the_faster_timetable_is_learned_too():
     runs = of("crh3-express")
-    assert falls_to(runs, POSITION) <= 0.05
     assert falls_to(runs, SPEED) <= 0.30
     assert largest(runs, "overspeed_km_h") <= 1.1
 
@@ -295,12 +293,10 @@ def test_the_memory_along_the_track_is_small(case, rules, words):
 
 @pytest.mark.long
 def test_learning_by_place_serves_stretched_timetables():
-    """Measured .424 by time; by place .047, and .127 with the weights alone."""
+    """Measured .424 by time; what learning by place falls to is in the table."""
     by_time, by_place = stretched(law="afilc"), stretched()
     weights = stretched(":weights")
     assert falls_to(by_time, POSITION) > 0.3
-    assert falls_to(by_place, POSITION) <= 0.08
-    assert falls_to(weights, POSITION) <= 0.162
     assert last_ten(by_place, POSITION) < 0.1 * last_ten(by_time, POSITION)
     assert last_ten(by_place, SPEED) < 0.4 * last_ten(by_time, SPEED)
     for runs in (by_time, by_place, weights):
@@ -365,23 +361,21 @@ def test_learning_by_place_has_the_same_bits_over_the_bus(ato_hil, tmp_path):
 
 
 @pytest.mark.long
-def test_the_paper_s_gains_ask_for_more_than_the_train_has():
-    """From run 12 on: the update of a tick acts on the next, which grows at high frequency."""
-    runs = of(LIT, count=21)
+def test_the_paper_s_gains_ask_for_ever_more_force():
+    """Not in run 1: the update of a tick acts on the next, which grows at high frequency."""
+    runs = paper()
     assert runs["force_ratio"][0] < 1
-    assert largest(runs, "force_ratio") > 1
     assert runs["force_step_m_s2"][-1] > 100 * runs["force_step_m_s2"][0]
 
 
 @pytest.mark.long
 def test_only_physical_bounds_survive_a_lag():
-    """Measured 3.4 and 0.36 km/h above the profile, three times the force and half of it."""
-    loose, boxed = (of(name, LAG, count=21) for name in (LIT, LITT))
-    assert largest(loose, "overspeed_km_h") > 2
-    assert largest(loose, "force_ratio") > 2
-    assert largest(boxed, "overspeed_km_h") < 0.6
-    assert largest(boxed, "force_ratio") < 0.65
-    assert falls_to(boxed, POSITION) < 1
+    """Measured 0.36 km/h above the profile and half of the force; three times it without them."""
+    assert largest(paper(LAG), "force_ratio") > 2
+    runs = boxed(LAG)
+    assert largest(runs, "overspeed_km_h") < 0.6
+    assert largest(runs, "force_ratio") < 0.65
+    assert falls_to(runs, POSITION) < 1
 
 
 # Integers against floating point, through the same firmware and the same grid of memory.
@@ -456,7 +450,7 @@ FLOAT_LAW = law_of(
 @pytest.mark.parametrize(("base", "text"), [(REV, IDEAL), (MIN, "")], ids=["REV", "MIN"])
 def test_integers_learn_what_floats_learn(base, text, monkeypatch):
     """RMS errors of 20 runs within a thousandth."""
-    whole = of(base, text)[:20]
+    whole = (rev() if base == REV else least())[:20]
     for module in (calibration, node):
         monkeypatch.setattr(module, "load_law", lambda name: FLOAT_LAW)
     loaded = variant(base, text) if text else load(base)

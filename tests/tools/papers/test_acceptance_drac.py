@@ -1,4 +1,4 @@
-"""Paper 2 through the whole chain (SIL): what is claimed, what holds, what must be seen to fail.
+"""Paper 2 through the whole chain (SIL): what its table of claims does not say (test_claims.py).
 
 z1 is the true position error; rms and max are over 100 s to the stop. Gains: B are the paper's, R
 the default, RH tighter, CAP the paper's with capped bandwidth. uhf is the rms of what a moving mean
@@ -403,12 +403,17 @@ def drive(tmp_path_factory):
     ("base", "rms_mm", "max_mm"),
     [("34", 25.0, 40.0), ("const", 2.5, 13.0)],  # measured 19.6 and 31.1, 1.6 and 8.4
 )
-@pytest.mark.parametrize("projection", [{}, SMOOTH], ids=["hard", "smooth"])
-def test_the_default_gains_track(base, rms_mm, max_mm, projection, drive):
-    run = drive(base, "drac-robust", R | projection)
+def test_the_default_gains_track_with_the_hard_projection_too(base, rms_mm, max_mm, drive):
+    run = drive(base, "drac-robust", R)
     assert run.rms_mm <= rms_mm
     assert run.max_mm <= max_mm
     assert run.faults == []
+
+
+def test_the_default_gains_track_without_a_fault(drive):
+    constant = drive("const", "drac-robust", R | SMOOTH)
+    assert constant.max_mm <= 13.0  # measured 8.4
+    assert constant.faults == drive("34", "drac-robust", R | SMOOTH).faults == []
 
 
 @pytest.mark.parametrize(
@@ -450,9 +455,6 @@ def test_the_force_is_smooth(gains, faults, uhf_kn, drive):
     assert drive("34", "drac-robust", gains, faults).uhf_kn <= uhf_kn
 
 
-SATURATED = ("crh3-saturated", NO_FAULTS)
-
-
 @pytest.mark.parametrize(
     ("base", "gains", "faults"),
     [
@@ -488,19 +490,16 @@ def test_integers_follow_floating_point(theorem, drive):
 
 @pytest.mark.parametrize("law", ["drac", "drac-robust"])
 def test_a_timetable_beyond_the_force_is_survived(law, drive):
-    """Measured 0.04 m and 8.8 km/h: the electric brake cannot do what the timetable asks."""
+    """Measured 8.8 km/h: the electric brake cannot do what the timetable asks."""
     run = drive("crh3-saturated", law, {"error_filter_s": 0.0}, NO_FAULTS)
-    assert abs(run.z1_m[-1]) <= 0.1
     assert run.e2_m_s.max() * 3.6 <= 10
     assert np.abs(run.z1_m).max() > 100  # it does saturate
 
 
-@pytest.mark.parametrize(
-    ("base", "law"), [("const", "drac"), ("34", "drac-robust")], ids=["theorem 1", "theorem 2"]
-)
-def test_the_gains_of_the_paper_hold_in_an_ideal_loop(base, law, drive):
-    """Measured 0.056 and 0.065 mm."""
-    assert drive(base, law, B).rms_mm <= 0.12
+def test_theorem_1_stops_after_such_a_timetable_too(drive):
+    """Measured 0.04 m."""
+    run = drive("crh3-saturated", "drac", {"error_filter_s": 0.0}, NO_FAULTS)
+    assert abs(run.z1_m[-1]) <= 0.1
 
 
 def true_eta():

@@ -1,4 +1,4 @@
-"""Paper 5 through the whole chain (SIL): what is claimed, what holds, what must be seen to fail.
+"""Paper 5 through the whole chain (SIL): what its table of claims does not say (test_claims.py).
 
 v and s are the rms errors of the true speed and position over a run, E the work of traction. Run 0
 is the first, learning starts with run 1. Cases I to VIII are the paper's, "ours" is the default
@@ -20,6 +20,7 @@ from ato_hil.controller.interface import INPUTS
 from ato_hil.controller.laws import iplc
 from ato_hil.controller.registry import law_of
 from ato_hil.plant_sim.scenario import load, overlaid
+from ato_hil.tools.papers.iplc.claims import contraction
 from ato_hil.tools.papers.iplc.reference import REFERENCES
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.frames import commanded_force_n
@@ -80,11 +81,6 @@ def v(row):
 
 def energy(row):
     return row["energy_kwh_per_t"]
-
-
-def contraction(rows):
-    """Mean factor from run to run of the position error, runs 1 to 10."""
-    return (s(rows[10]) / s(rows[1])) ** (1 / 9)
 
 
 # What a few runs show.
@@ -159,7 +155,6 @@ def test_a2_prediction_lowers_the_error_that_is_left():
     one, three = (learn(f"gradient-paper:{case}", 30)[-1] for case in ("I", "II"))
     assert 3900 <= s(one) <= 4070
     assert 1470 <= s(three) <= 1560
-    assert s(one) / s(three) >= 2.4
 
 
 @pytest.mark.long
@@ -172,21 +167,21 @@ def test_a2_in_the_other_reading_it_does_not():
 
 @pytest.mark.long
 def test_a2_the_weight_of_the_input_trades_error_for_energy():
-    """VI (S = 0), IV's weights with R = 5 (S = 0.5), VII (1), VIII (2); each step 2 % and more."""
+    """VI (S = 0), its weights with S = 0.5, VII (1); each step 2 % and more. From VII to VIII (2):
+    the table."""
     rows = [
         learn("gradient-paper:VI", 30)[-1],
         learn("gradient-paper:VI", 30, **law(S=0.5))[-1],
         learn("gradient-paper:VII", 30)[-1],
-        learn("gradient-paper:VIII", 30)[-1],
     ]
     assert s(rows[0]) <= 8.0
     assert v(rows[0]) <= 0.5
     for less, more in pairwise(rows):
         assert s(more) >= 1.02 * s(less)
         assert energy(more) <= energy(less) / 1.02
-    # It does not finish the trip: 28 to 36 km of 36.28 km.
-    assert rows[-1]["end_m"] < 32.5e3
     assert abs(rows[0]["stop_error_m"]) < 5.0
+    # At S = 2 it does not finish the trip: 28 to 36 km of 36.28 km.
+    assert learn("gradient-paper:VIII", 30)[-1]["end_m"] < 32.5e3
 
 
 @pytest.mark.long
@@ -225,14 +220,13 @@ def test_a4_a_larger_weight_of_the_change_is_not_always_faster():
 
 @pytest.mark.long
 def test_a4_with_ten_times_the_weight_of_the_error_it_is():
-    """0.993, 0.638, 0.617."""
+    """0.993 and 0.638; R = 50: the table."""
     Q = [[10.0, 0.0], [0.0, 10.0]]
-    rates = [
-        contraction(learn(f"gradient-paper:{case}", 10, **law(Q=Q))) for case in ("III", "IV", "V")
-    ]
-    assert rates[0] >= 0.97
-    assert rates[1] <= 0.68
-    assert rates[2] <= rates[1]
+    none, some = (
+        contraction(learn(f"gradient-paper:{case}", 10, **law(Q=Q))) for case in ("III", "IV")
+    )
+    assert none >= 0.97
+    assert some <= 0.68
 
 
 # A5, A6: identities of the law.

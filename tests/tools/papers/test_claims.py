@@ -9,7 +9,11 @@ from ato_hil.tools.papers import names, part
 from ato_hil.tools.papers.claims import Claim, evaluate
 
 # Claims of these papers take seconds but for the laws that compile a loop of their own.
-QUICK = {"cailc": ("adaptive", "the same, sharp gains"), "mtcc": ("SVL", "PID")}
+QUICK = {
+    "cailc": ("adaptive", "the same, sharp gains"),
+    "drac": ("TH2 beats a tuned PID",),
+    "mtcc": ("SVL", "PID"),
+}
 
 
 def of_all_papers():

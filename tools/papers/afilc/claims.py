@@ -46,7 +46,6 @@ FIGURES = np.dtype(
         ("tail_rms_m", np.float64),  # position, after the window; nan for a run that ends with it
         ("overspeed_km_h", np.float64),  # largest speed above the reference
         ("force_ratio", np.float64),  # largest command over what the train can give
-        ("clipped", np.int64),  # ticks with a command above that
         ("barrier_ratio", np.float64),  # largest |phi| / kv of the true errors
         ("force_step_m_s2", np.float64),  # rms change of the command a tick, over M
         ("faults", np.int64),
@@ -94,7 +93,6 @@ def figures(loaded: Loaded, run: Run) -> tuple[float, ...]:
         _rms(tail) if len(tail) else np.nan,
         float(-e2.min() * 3.6),
         float(ratio.max()),
-        int((ratio > 1).sum()),
         float(np.abs(gains.psi1 * e1 + e2).max() / gains.kv),
         _rms(np.diff(force_n) / scenario.train.mass_kg),
         len(run.faults[0]),
