@@ -43,7 +43,7 @@ OPERATION = struct.Struct("<II")
 PERIODS_WITHOUT_RUN = 100  # of a plant that arms none
 PROGRESS_TICKS = 500
 HEADER = ("Crc", "Counter", "DataIdNibble")
-MADE_FOR = re.compile(r"scenario (\w+)")
+MADE_FOR = re.compile(r"(\w+), scenario (\w+)")
 
 FRAME_IDS = [message.frame_id for message in MESSAGES]
 
@@ -216,7 +216,7 @@ def controller(file: Path, loaded: Loaded, train: int, stack: ExitStack) -> Cont
     """The controller of a train; closing `stack` ends it. Raises FmuError."""
     received, sent = onboard.frames(loaded)
     start = {"train": float(train)} if loaded.trains > 1 else {}
-    fmu = _opened(file, loaded, received, sent, [], start, stack)
+    fmu = _opened(file, "controller", loaded, received, sent, [], start, stack)
     return Controller(_node(fmu, received, sent))
 
 
@@ -227,12 +227,13 @@ def world(
     sent, received = onboard.frames(loaded)
     truth = [f"truth.{name}" for name in plant.TRUTH.names or ()]
     start = {"seed": float(seed), "first_run": float(runs[0]), "last_run": float(runs[-1])}
-    fmu = _opened(file, loaded, received, sent, truth, start, stack)
+    fmu = _opened(file, "plant", loaded, received, sent, truth, start, stack)
     return _node(fmu, received, sent)
 
 
 def _opened(
     file: Path,
+    part: str,
     loaded: Loaded,
     received: Sequence[str],
     sent: Sequence[str],
@@ -257,8 +258,10 @@ def _opened(
         stack,
     )
     made_for = MADE_FOR.match(fmu.opened.version)
-    if made_for and made_for[1] != loaded.digest:
-        raise FmuError(f"{file}: made for scenario {made_for[1]}, expected {loaded.digest}")
+    if made_for and made_for[1] != part:
+        raise FmuError(f"{file}: the FMU of a {made_for[1]}, expected that of a {part}")
+    if made_for and made_for[2] != loaded.digest:
+        raise FmuError(f"{file}: made for scenario {made_for[2]}, expected {loaded.digest}")
     return fmu
 
 

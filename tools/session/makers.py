@@ -136,6 +136,10 @@ class OnTarget(InProcess):
 class Foreign(InProcess):
     """The same with FMUs in the place of the controllers, of the plant, or of both."""
 
+    def _next(self, made: Generator[Run, None, None]) -> Run | None:
+        with self.interrupts.let_through():
+            return next(made, None)  # an FMU that is not what was asked for is bad input
+
     def _made(self) -> Generator[Run, None, None]:
         setup, options = self.setup, self.setup.options
         ours = [node.build(each, options.memory, options.firmware) for each in setup.calibrations]

@@ -54,11 +54,12 @@ def lint(module: ModuleType) -> list[str]:
 
 
 STORE = "    state.integral = integral\n"
+SHIFT = "integral >> (Q_SPEED - Q_INTEGRAL)"
 CLAMP = "clamp(wanted, -int64(params.force_max), int64(params.force_max))"
 
 MUTANTS = {
     "a float": ("change = eps -", "change = 0.5 * eps -", "float"),
-    "a true division": ("integral >> 8", "integral / 256", "float"),
+    "a true division": (SHIFT, "integral / 256", "float"),
     "a dropped clamp": (CLAMP, "wanted", "clamp"),
     "an allocated array": (STORE, f"{STORE}    spare = np.zeros(3, np.int64)\n", "call"),
     "an unbounded loop": (
@@ -71,10 +72,14 @@ MUTANTS = {
         f"    for k in range(eps):\n        integral -= k\n{STORE}",
         "loop",
     ),
-    "a division by data": ("integral >> 8", "integral // change", "division"),
-    "a shift by data": ("integral >> 8", "integral >> change", "shift"),
-    "a shift by 63": ("integral >> 8", "integral >> 63", "shift"),
-    "round_shift by data": ("int64(params.gp), 21)", "int64(params.gp), change)", "shift"),
+    "a division by data": (SHIFT, "integral // change", "division"),
+    "a shift by data": (SHIFT, "integral >> change", "shift"),
+    "a shift by 63": (SHIFT, "integral >> 63", "shift"),
+    "round_shift by data": (
+        "int64(params.gp), Q_SPEED + Q_GAIN - Q_ACCELERATION)",
+        "int64(params.gp), change)",
+        "shift",
+    ),
     "a field not widened": ("int64(state.integral) + eps", "state.integral + eps", "widen"),
     "an unsigned integer": ("int64(state.last)", "np.uint64(state.last)", "unsigned"),
     "recursion": (
@@ -139,7 +144,7 @@ def compiled_pid(module: ModuleType) -> list[str]:
 
 
 def test_a_float_is_seen_in_the_code(tmp_path):
-    module = mutant(tmp_path, "sat32(integral >> 8)", "int64((integral >> 8) * 0.3)")
+    module = mutant(tmp_path, f"sat32({SHIFT})", f"int64(({SHIFT}) * 0.3)")
     assert any(found.startswith("float: ") for found in compiled_pid(module))
 
 

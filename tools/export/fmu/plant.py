@@ -41,7 +41,7 @@ def unpacked(loaded: Loaded, law: str | None, bus: str = "can") -> Unpacked:
         title=f"Train, {loaded.name}",
         text=f"Train, track, ATP and sensors of scenario {loaded.name}",
         version=importlib.metadata.version("ato-hil"),
-        content=f"scenario {loaded.digest}, sources {source_digest()}, bus {bus}",
+        content=f"plant, scenario {loaded.digest}, sources {source_digest()}, bus {bus}",
         period_s=loaded.scenario.period_s,
         stop_s=round(len(runs) * (loaded.ticks + 2) * loaded.scenario.period_s, 9),
     )

@@ -37,7 +37,7 @@ def unpacked(loaded: Loaded, _law: str | None, _bus: str) -> Unpacked:
         title=f"Bare train, {loaded.name}",
         text=f"Train and track of scenario {loaded.name}: forces in, motion out",
         version=importlib.metadata.version("ato-hil"),
-        content=f"scenario {loaded.digest}, sources {source_digest()}",
+        content=f"train, scenario {loaded.digest}, sources {source_digest()}",
         period_s=loaded.scenario.period_s,
         stop_s=round(loaded.ticks * loaded.scenario.period_s, 9),
     )
