@@ -225,6 +225,16 @@ class _StepCache(_Cache):
     def flush(self) -> None: ...
 
 
+_WITHOUT_COMPILER = False
+
+
+def allow_interpreted() -> None:
+    """From now on steps are interpreted where numba is told not to compile: for a session whose
+    plant and controllers are, as its few other steps can be."""
+    global _WITHOUT_COMPILER  # noqa: PLW0603 - of the process, as numba's own setting is
+    _WITHOUT_COMPILER = True
+
+
 def require_compiler() -> None:
     """Raises StepError where steps are neither compiled nor interpreted."""
     if numba.config.DISABLE_JIT and not INTERPRETED:
@@ -238,8 +248,10 @@ def _uncompiled(function: Any) -> Any:
     """What stands for a step where numba is told not to compile."""
 
     @functools.wraps(function)
-    def refuse(*_arguments: Any) -> None:
-        require_compiler()
+    def refuse(*arguments: Any) -> Any:
+        if not _WITHOUT_COMPILER:
+            require_compiler()
+        return function(*arguments)
 
     refuse._uuid = _stable_identity(function)  # type: ignore[attr-defined]
     return refuse

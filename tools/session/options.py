@@ -12,7 +12,7 @@ import numpy as np
 
 from ato_hil.can_dbc import faults
 from ato_hil.can_dbc.errors import InputError
-from ato_hil.can_dbc.step import require_compiler
+from ato_hil.can_dbc.step import allow_interpreted, require_compiler
 from ato_hil.controller import library, node, store
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.registry import load_law
@@ -181,7 +181,9 @@ def check(options: Options, held: ExitStack) -> Setup:
         raise SessionError(f"mode is {options.mode!r}, expected one of {', '.join(MODES)}")
     limits.check_address_space(options.trace)
     limits.check_descriptors()
-    if options.mode != "mil":
+    if options.mode == "mil":
+        allow_interpreted()
+    else:
         require_compiler()
     loaded = load(options.scenario)
     trains = members(loaded)

@@ -181,7 +181,8 @@ def test_ctrl_c_ends_every_process_with_one_line(tmp_path: Path) -> None:
     os.killpg(sweeping.pid, signal.SIGINT)
     _out, said = sweeping.communicate(timeout=120)
     assert sweeping.returncode == 130
-    assert said.strip() == "ato-hil: interrupted; nothing was written"
+    # The signal may come before the first point is begun.
+    assert said.strip() in ("ato-hil: interrupted; nothing was written", "ato-hil: interrupted")
     while any(map(runs, workers)):  # the tracker ends when it sees that the others have
         time.sleep(0.1)
     assert list((tmp_path / "o").iterdir()) == []
