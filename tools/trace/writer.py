@@ -179,6 +179,7 @@ class TraceWriter:
         self._period_s = period_s
         self._run: int | None = None
         self._layout: Layout | None = None
+        self._owed = False  # whether the file lacks it
         self._fields: tuple[str, ...] = ()  # of the plant's state
         self._states: dict[str, int] = {}  # last value of each lane, by its entity
         self._traffic: dict[int, tuple[int, Traffic, Checks]] = {}  # run and state, by train
@@ -402,7 +403,7 @@ class TraceWriter:
             self._log_memory()
         for train, (run, traffic, _checks) in self._traffic.items():
             self._log_windows(run, train, traffic, traffic.finish())
-        if self._layout is not None:
+        if self._owed and self._layout is not None:
             self._file.send_blueprint(of_session(self._layout))
         try:
             self._file.flush()
@@ -447,12 +448,14 @@ class TraceWriter:
             timing=any(entity.startswith("timing/") for entity in self._logged),
         )
         if layout != self._layout:
-            # A layout takes 0.4 MB: the file gets the first and the last one.
-            first, self._layout = self._layout is None, layout
+            # A layout takes 0.4 MB: the file gets those of the first run, and the last one.
+            self._layout = layout
+            whole = layout.run == self._run_name(self._first_run)
             blueprint = of_session(layout)
             for stream in self._streams:
-                if first or stream is not self._file:
+                if whole or stream is not self._file:
                     stream.send_blueprint(blueprint)
+            self._owed = not whole
 
     def _entity(self, name: str, run: int, train: int) -> str:
         return f"{name}/{self._place(run, train)}"
