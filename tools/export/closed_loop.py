@@ -40,7 +40,7 @@ from ato_hil.tools.export.kinds import (
     Fields,
     Rows,
 )
-from ato_hil.tools.export.program import Program, resolved, settled_constants
+from ato_hil.tools.export.program import Program, resolved
 from ato_hil.tools.export.records import Records
 from ato_hil.tools.export.translate import new_program
 from ato_hil.tools.runs import onboard
@@ -122,14 +122,8 @@ class Loop:
     def text(self) -> str:
         """The program, one file."""
         program = self.program
-        functions = [f for m in program.modules for f in firmware.in_order(program, m)]
-        taken = {name for f in functions for name in firmware.identifiers(f)}
-        names = settled_constants(program, taken)
-        body: list[str] = []
-        for module in program.modules:
-            body += ["", f"/* {module.file} */"]
-            for function in firmware.in_order(program, module):
-                body += ["", *firmware.definition(program, function, function is self.loop)]
+        functions, names = firmware.settled(program)
+        body = firmware.definitions(program, [self.loop])
         heads = [f"static {program.head(f)};" for f in functions if f is not self.loop]
         heads.append(f"{program.head(self.loop)};")
         arrays = array_types(program)  # they name the last records

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import inspect
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -144,9 +144,7 @@ def top(made: Firmware, text: str) -> list[str]:
 def source_file(made: Translated) -> str:
     """ato.c."""
     program = made.program
-    functions = [f for module in program.modules for f in in_order(program, module)]
-    taken = {name for f in functions for name in identifiers(f)}
-    names = settled_constants(program, taken)
+    functions, names = settled(program)
     body: list[str] = []
     for module in program.modules:
         body += ["", *comment_lines("", f"{module.file}: {first_line(module.tree)}")]
@@ -199,6 +197,23 @@ def in_order(program: Program, module: Any) -> list[Function]:
     return sorted(found, key=lambda function: (function.step.node.lineno, function.name))
 
 
+def settled(program: Program) -> tuple[list[Function], dict[tuple[str, Any], str]]:
+    """All functions, as they stand in the sources, and the names of the constants beside them."""
+    functions = [f for module in program.modules for f in in_order(program, module)]
+    taken = {name for function in functions for name in _identifiers(function)}
+    return functions, settled_constants(program, taken)
+
+
+def definitions(program: Program, public: Sequence[Function]) -> list[str]:
+    """All functions by module, each below the name of its file."""
+    lines: list[str] = []
+    for module in program.modules:
+        lines += ["", f"/* {module.file} */"]
+        for function in in_order(program, module):
+            lines += ["", *definition(program, function, function in public)]
+    return lines
+
+
 def definition(program: Program, function: Function, is_public: bool) -> list[str]:
     """A function with its docstring."""
     static = "" if is_public else "static "
@@ -211,7 +226,7 @@ def definition(program: Program, function: Function, is_public: bool) -> list[st
     ]
 
 
-def identifiers(function: Function) -> set[str]:
+def _identifiers(function: Function) -> set[str]:
     """Names of a function's parameters and variables, and of the fields it could use."""
     return {*function.step.parameters, *function.step.function.__code__.co_varnames}
 

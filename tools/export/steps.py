@@ -7,7 +7,7 @@ from types import ModuleType
 from typing import Any
 
 from ato_hil.tools.export import firmware
-from ato_hil.tools.export.program import Function, Program, resolved, settled_constants
+from ato_hil.tools.export.program import Function, Program, resolved
 from ato_hil.tools.export.records import Records
 from ato_hil.tools.export.translate import new_program
 
@@ -29,9 +29,7 @@ def text_of(roots: Sequence[tuple[str, Any, Sequence[Any]]], modules: Sequence[M
 
 
 def _lines(program: Program, records: Records, roots: Sequence[Function]) -> list[str]:
-    functions = [f for module in program.modules for f in firmware.in_order(program, module)]
-    taken = {name for function in functions for name in firmware.identifiers(function)}
-    names = settled_constants(program, taken)
+    functions, names = firmware.settled(program)
     body: list[str] = []
     for function in functions:
         body += firmware.definition(program, function, function in roots)

@@ -13,7 +13,7 @@ from ato_hil.tools.export.fmu.description import About
 from ato_hil.tools.export.fmu.variables import Frame, Interface
 from ato_hil.tools.export.kinds import INT, SignalPlace
 from ato_hil.tools.export.lines import number_text
-from ato_hil.tools.export.program import resolved, settled_constants
+from ato_hil.tools.export.program import resolved
 from ato_hil.tools.export.records import Records
 from ato_hil.tools.export.translate import new_program
 
@@ -98,9 +98,7 @@ def frames_file(made: Interface) -> str:
             program.root(e2e.next_counter, (INT,)),
         ]
     roots.append(program.root(e2e.check, (INT, INT, INT)))
-    functions = [f for module in program.modules for f in firmware.in_order(program, module)]
-    taken = {name for function in functions for name in firmware.identifiers(function)}
-    names = settled_constants(program, taken)
+    functions, names = firmware.settled(program)
     for function in roots:
         function.name = function.step.name
     body: list[str] = []

@@ -11,7 +11,7 @@ from ato_hil.can_dbc import codec, e2e
 from ato_hil.tools.export import closed_loop, firmware
 from ato_hil.tools.export.closed_loop import LIMITS, REAL
 from ato_hil.tools.export.lines import wrapped
-from ato_hil.tools.export.program import resolved, settled_constants
+from ato_hil.tools.export.program import resolved
 from ato_hil.tools.export.records import Records
 from ato_hil.tools.export.translate import new_program
 
@@ -77,14 +77,8 @@ class Unit:
     def source(self) -> str:
         """The functions."""
         program = self.program
-        functions = [f for m in program.modules for f in firmware.in_order(program, m)]
-        taken = {name for f in functions for name in firmware.identifiers(f)}
-        names = settled_constants(program, taken)
-        body: list[str] = []
-        for module in program.modules:
-            body += ["", f"/* {module.file} */"]
-            for function in firmware.in_order(program, module):
-                body += ["", *firmware.definition(program, function, function in self.functions)]
+        functions, names = firmware.settled(program)
+        body = firmware.definitions(program, self.functions)
         text = "\n".join(body)
         reals = [line for line in REAL.splitlines() if f"{line.split('(')[0].split()[-1]}(" in text]
         lines = [
