@@ -19,9 +19,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ato_hil.can_dbc.errors import InputError, expected
+from ato_hil.tools.runs.folder import STATE, lines_of, names_of_lines
 from ato_hil.tools.trace import live_viewer
 from ato_hil.tools.trace.blueprints import BARS, of_several, title_of
 from ato_hil.tools.trace.colours import REFERENCE, Colour, apart
+from ato_hil.tools.trace.drain import Drain
 
 if TYPE_CHECKING:
     from rerun.chunk import Chunk
@@ -113,14 +115,17 @@ def overlay(recorded: Sequence[Recorded], file: Path, law_compare: bool = False)
     """Writes a trace of several sessions: the last run of each over the others, and their errors by
     run.
 
-    Raises ViewError if a session has no complete run, or its trace cannot be read.
+    Raises ViewError if a session has no complete run, its trace cannot be read, or `file` not
+    written whole.
     """
     import rerun as rr
 
     stream = rr.RecordingStream("ato-hil", recording_id="sessions")
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
-    stream.set_sinks(rr.FileSink(file))
+    drain = Drain(file)
+    stream.set_sinks(rr.FileSink(drain.entrance))
+    drain.opened()
     stream.send_recording_name(", ".join(each.label for each in recorded))
     try:
         for number, each in enumerate(recorded):
@@ -136,6 +141,10 @@ def overlay(recorded: Sequence[Recorded], file: Path, law_compare: bool = False)
         stream.flush()
     finally:
         stream.disconnect()
+    try:
+        drain.close()
+    except OSError as error:
+        raise ViewError(f"{file}: cannot write there: {error.strerror}") from None
 
 
 def _add(stream: Any, recorded: Recorded, colour: Colour, first: bool) -> None:
@@ -148,20 +157,18 @@ def _add(stream: Any, recorded: Recorded, colour: Colour, first: bool) -> None:
         names=[recorded.label], colors=[colour], widths=[1.5], aggregation_policy=as_it_is
     )
     names = {  # of the lines of an entity
-        chunk.entity_path: chunk.to_record_batch().column("SeriesLines:names").to_pylist()[0]
+        chunk.entity_path: names_of_lines(chunk.to_record_batch())
         for chunk in _chunks(recorded, static=True)
-        if chunk.entity_path.startswith("/truth/state/")
+        if chunk.entity_path.startswith(f"/truth/{STATE}/")
     }
     for chunk in _chunks(recorded, static=False):
         match chunk.entity_path.strip("/").split("/"):
             case ["truth", _, run, *_] if _number(run) != last:
                 continue
-            case ["truth", "state", _, *train]:
+            case ["truth", entity, _, *train] if entity == STATE:
                 batch = chunk.to_record_batch()
-                values = batch.column("Scalars:scalars")
-                table = values.flatten().to_numpy().reshape(len(values), -1)
                 index = [rr.TimeColumn("time", duration=batch.column("time").to_numpy())]
-                for field, column in zip(names[chunk.entity_path], table.T, strict=True):
+                for field, column in zip(names[chunk.entity_path], lines_of(batch).T, strict=True):
                     if field in OVERLAID:
                         entity = "/".join([field, recorded.label, *train])
                         stream.log(entity, style, static=True, strict=True)

@@ -31,7 +31,6 @@ straight line between its neighbours is left out, since a plot draws that line a
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import time
@@ -70,6 +69,7 @@ from ato_hil.tools.trace.colours import (
     apart,
     ramp,
 )
+from ato_hil.tools.trace.drain import Drain
 from ato_hil.tools.trace.plots import (
     LANES,
     MAX_CARS,
@@ -179,7 +179,7 @@ class TraceWriter:
         self._period_s = period_s
         self._run: int | None = None
         self._layout: Layout | None = None
-        self._owed = False  # whether the file lacks it
+        self._layout_of_file: Layout | None = None
         self._fields: tuple[str, ...] = ()  # of the plant's state
         self._states: dict[str, int] = {}  # last value of each lane, by its entity
         self._traffic: dict[int, tuple[int, Traffic, Checks]] = {}  # run and state, by train
@@ -194,7 +194,12 @@ class TraceWriter:
         # Equal for equal arguments, but for no two files: a viewer merges recordings of one name.
         identity = (str(path.resolve()), title, period_s, cars, estimates, first_run, last_run)
         name = hashlib.blake2b(repr(identity).encode(), digest_size=16).hexdigest()
-        self._file = self._open(rr.FileSink(path), name, title)
+        try:
+            self._drain = Drain(path)
+        except OSError as error:
+            raise TraceError(f"{path}: cannot write the trace: {error.strerror}") from None
+        self._file = self._open(rr.FileSink(self._drain.entrance), name, title)
+        self._drain.opened()
         self._streams = [self._file]
         if live_port is not None:
             server = rr.GrpcServerSink("127.0.0.1", live_port, server_memory_limit=LIVE_MEMORY)
@@ -403,17 +408,14 @@ class TraceWriter:
             self._log_memory()
         for train, (run, traffic, _checks) in self._traffic.items():
             self._log_windows(run, train, traffic, traffic.finish())
-        if self._owed and self._layout is not None:
-            self._file.send_blueprint(of_session(self._layout))
+        self._lay_out_file()
+        self._file.flush()
+        self._file.disconnect()
+        self._streams.remove(self._file)
         try:
-            self._file.flush()
-        except RuntimeError as error:
-            full = os.statvfs(self._path.parent).f_bavail == 0
-            reason = os.strerror(errno.ENOSPC) if full else error
-            raise TraceError(f"{self._path}: the trace is incomplete: {reason}") from None
-        finally:
-            self._file.disconnect()
-            self._streams.remove(self._file)
+            self._drain.close()
+        except OSError as error:
+            raise TraceError(f"{self._path}: the trace is incomplete: {error.strerror}") from None
 
     @property
     def is_live(self) -> bool:
@@ -448,14 +450,18 @@ class TraceWriter:
             timing=any(entity.startswith("timing/") for entity in self._logged),
         )
         if layout != self._layout:
-            # A layout takes 0.4 MB: the file gets those of the first run, and the last one.
             self._layout = layout
-            whole = layout.run == self._run_name(self._first_run)
-            blueprint = of_session(layout)
             for stream in self._streams:
-                if whole or stream is not self._file:
-                    stream.send_blueprint(blueprint)
-            self._owed = not whole
+                if stream is not self._file:
+                    stream.send_blueprint(of_session(layout))
+            if self._layout_of_file is None:
+                self._lay_out_file()
+
+    def _lay_out_file(self) -> None:
+        """Give the file the layout of now; it takes 0.4 MB, so only the first and the last one."""
+        if self._layout is not None and self._layout != self._layout_of_file:
+            self._layout_of_file = self._layout
+            self._file.send_blueprint(of_session(self._layout))
 
     def _entity(self, name: str, run: int, train: int) -> str:
         return f"{name}/{self._place(run, train)}"

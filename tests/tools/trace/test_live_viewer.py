@@ -227,6 +227,7 @@ def test_a_session_that_is_told_to_end_keeps_all_of_the_runs_that_it_has_finishe
             # Also where the tests run in the background, where Ctrl-C is ignored.
             *(sys.executable, "-c", HEARS_CTRL_C, "run", str(SHORT), "--mode", mode),
             *("--runs", "900", "--bus", "hub:ending", "--out", str(tmp_path)),
+            *("--trace", "full"),
         ],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

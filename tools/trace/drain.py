@@ -1,0 +1,54 @@
+"""A file that is written through a pipe, so that its errors are ours.
+
+Rerun's own writer ends at the first error, a full disk say, and tells no number; a flush that waits
+in its queue then waits for ever. So it writes into a pipe, which takes everything.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+PIECE = 1 << 20  # bytes
+
+
+class Drain:
+    """Writes into a file what comes through a pipe, in a thread of its own."""
+
+    def __init__(self, path: Path) -> None:
+        """Make the file. Raises OSError."""
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        self._read, self._write = os.pipe()
+        self._error: OSError | None = None
+        # A program that never closes it still ends.
+        self._thread = threading.Thread(target=self._run, name="trace file", daemon=True)
+        self._thread.start()
+
+    @property
+    def entrance(self) -> str:
+        """Name of the pipe, for one who opens it to write; then call `opened`."""
+        return f"/dev/fd/{self._write}"
+
+    def opened(self) -> None:
+        """The file is whole when all who opened the pipe have closed it."""
+        os.close(self._write)
+
+    def close(self) -> None:
+        """Wait until the file is whole. Raises OSError: it is not."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        while piece := os.read(self._read, PIECE):
+            try:
+                while piece and self._error is None:
+                    piece = piece[os.write(self._file, piece) :]
+            except OSError as error:
+                self._error = error  # what comes now is read and dropped: nobody is to wait
+        try:
+            os.close(self._file)
+        except OSError as error:
+            self._error = self._error or error
+        os.close(self._read)
