@@ -18,6 +18,23 @@ def python(*arguments: str) -> list[str]:
     return [sys.executable, "-P", *arguments]
 
 
+# Ends with its parent, whatever ends that: then becomes the program.
+_FOLLOW_PARENT = """
+import ctypes, os, signal, sys
+prctl = getattr(ctypes.CDLL(None), "prctl", None)
+if prctl is not None:
+    prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+if os.getppid() != int(sys.argv[1]):
+    sys.exit(1)
+os.execv(sys.argv[2], sys.argv[2:])
+"""
+
+
+def ends_with_parent(command: list[str]) -> list[str]:
+    """The command of a program that does not look after this process itself."""
+    return [sys.executable, "-I", "-S", "-c", _FOLLOW_PARENT, str(os.getpid()), *command]
+
+
 @contextmanager
 def safe_path() -> Iterator[None]:
     """The same for children that a library starts meanwhile, as a pool of processes does."""

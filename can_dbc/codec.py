@@ -156,6 +156,11 @@ INDEX_OF_FRAME_ID: dict[int, int] = {message.frame_id: message.index for message
 MAILBOX = np.dtype([("payload", np.int64), ("fresh", np.int32), ("padding", np.int32)], align=True)
 
 
+def signals_of(message: Any) -> tuple[str, ...]:
+    """Names of the signals of one of MESSAGES that the nodes know, the header's too."""
+    return tuple(name for name in message._fields if isinstance(getattr(message, name), Signal))
+
+
 def mailboxes() -> np.ndarray:
     """MESSAGE_COUNT empty mailboxes."""
     return np.zeros(MESSAGE_COUNT, MAILBOX)

@@ -16,12 +16,16 @@ from ato_hil.can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGE_COUNT, MESSAGES
 from ato_hil.can_dbc.fault_receiver import Receiver
 
 
-def fresh_frames(mailboxes: np.ndarray) -> list[tuple[int, int]]:
-    """What waits in mailboxes to be sent, in sending order; they are stale then."""
-    fresh = mailboxes["fresh"]
+def waiting_frames(mailboxes: np.ndarray) -> list[tuple[int, int]]:
+    """What waits in mailboxes, in sending order."""
     words = mailboxes["payload"].tolist()
-    frames = [(MESSAGES[i].frame_id, words[i]) for i in fresh.nonzero()[0].tolist()]
-    fresh.fill(0)
+    return [(MESSAGES[i].frame_id, words[i]) for i in mailboxes["fresh"].nonzero()[0].tolist()]
+
+
+def fresh_frames(mailboxes: np.ndarray) -> list[tuple[int, int]]:
+    """The same; they are stale then."""
+    frames = waiting_frames(mailboxes)
+    mailboxes["fresh"].fill(0)
     return frames
 
 

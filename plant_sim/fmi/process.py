@@ -5,12 +5,10 @@ Whatever becomes of that process, or comes from it, is one line that names the f
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 import struct
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
@@ -36,16 +34,6 @@ from ato_hil.plant_sim.fmi import (
 
 ANSWER_S = 20.0  # for the answer to a step
 OPEN_S = 120.0  # for a large file to be unpacked and loaded
-# Ends with its parent, whatever ends that: then becomes the child.
-FOLLOW_PARENT = """
-import ctypes, os, signal, sys
-prctl = getattr(ctypes.CDLL(None), "prctl", None)
-if prctl is not None:
-    prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-if os.getppid() != int(sys.argv[1]):
-    sys.exit(1)
-os.execv(sys.argv[2], sys.argv[2:])
-"""
 
 
 class FmuError(InputError):
@@ -160,7 +148,7 @@ def start(wanted: Wanted, stack: ExitStack) -> Fmu:
     with theirs:
         module = child.python("-m", "ato_hil.plant_sim.fmi.child", str(theirs.fileno()), folder)
         process = subprocess.Popen(
-            [sys.executable, "-I", "-S", "-c", FOLLOW_PARENT, str(os.getpid()), *module],
+            child.ends_with_parent(module),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

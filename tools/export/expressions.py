@@ -11,6 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from ato_hil.can_dbc.codec import signals_of
 from ato_hil.can_dbc.step import int64
 from ato_hil.tools.export.kinds import (
     AND,
@@ -39,7 +40,7 @@ from ato_hil.tools.export.kinds import (
 )
 from ato_hil.tools.export.lines import number_text
 from ato_hil.tools.export.places import Places
-from ato_hil.tools.export.program import Function, Program, c_name, is_message, signals_of
+from ato_hil.tools.export.program import Function, Program, c_name, is_message
 from ato_hil.tools.export.source import NOTHING, Module, Step, python_function, source_of, step_of
 
 HEADER = ("index", "frame_id", "data_id", "cycle_ms")  # of every message of the codec

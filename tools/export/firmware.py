@@ -17,6 +17,7 @@ from ato_hil.can_dbc.codec import (
     MESSAGE_COUNT,
     MESSAGES,
     database,
+    signals_of,
 )
 from ato_hil.controller import (
     firmware,
@@ -37,7 +38,6 @@ from ato_hil.tools.export.program import (
     Program,
     resolved,
     settled_constants,
-    signals_of,
 )
 from ato_hil.tools.export.records import Records, initialiser
 from ato_hil.tools.export.source import (

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ato_hil.can_dbc.codec import signals_of
 from ato_hil.controller.subset import C_KEYWORDS
 from ato_hil.tools.export import ExportError
 from ato_hil.tools.export.kinds import (
@@ -221,11 +222,6 @@ class Program:
     def table(self, name: str, module: Module, value: np.ndarray) -> str:
         known = self.tables.setdefault(id(value), Table(name.lstrip("_"), module, value))
         return known.name
-
-
-def signals_of(message: Any) -> tuple[str, ...]:
-    """Names of the signals of a message of the codec."""
-    return tuple(name for name in message._fields if hasattr(getattr(message, name), "is_signed"))
 
 
 def is_message(value: Any) -> bool:

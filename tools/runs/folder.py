@@ -231,7 +231,7 @@ class Folder:
                 key = (found["name"], int(found["run"]), int(found["train"] or 1) - 1)
                 batch = chunk.to_record_batch()
                 if chunk.is_static:
-                    names[key] = batch.column("SeriesLines:names").to_pylist()[0]
+                    names[key] = names_of_lines(batch)
                 else:
                     parts[key].append(_columns(batch, self.scenario.period_s))
         except (RuntimeError, ValueError, OSError) as error:
@@ -263,14 +263,24 @@ def _columns(batch: Any, period_s: float) -> tuple[np.ndarray, np.ndarray]:
     ticks = np.rint(np.asarray(batch.column("time")).astype(np.int64) / (1e9 * period_s))
     names = batch.schema.names
     if "Scalars:scalars" in names:
-        values = batch.column("Scalars:scalars")
-        return ticks * period_s, np.asarray(values.flatten()).reshape(len(values), -1)
+        return ticks * period_s, lines_of(batch)
     parts = [batch.column(f"ato_hil.Frames:{name}") for name in ("frame_id", "payload")]
     counts = np.asarray(parts[0].value_lengths())
     return (
         np.repeat(ticks, counts) * period_s,
         np.column_stack([np.asarray(p.flatten()) for p in parts]),
     )
+
+
+def names_of_lines(batch: Any) -> list[str]:
+    """What the lines of a plot are called, from its record of what holds at all times."""
+    return list(batch.column("SeriesLines:names").to_pylist()[0])
+
+
+def lines_of(batch: Any) -> np.ndarray:
+    """Values of the lines of a plot, (rows, lines)."""
+    values = batch.column("Scalars:scalars")
+    return np.asarray(values.flatten()).reshape(len(values), -1)
 
 
 def _joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> Series:

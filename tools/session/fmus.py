@@ -18,15 +18,17 @@ import numpy as np
 
 from ato_hil.can_dbc.codec import (
     ATO_STATUS,
+    HEADER,
     INDEX_OF_FRAME_ID,
     MESSAGES,
     RUN_CTRL,
     TRAIN_POSITION,
     bytes_of,
     mailboxes,
+    signals_of,
     word_of,
 )
-from ato_hil.can_dbc.inbox import fresh_frames
+from ato_hil.can_dbc.inbox import fresh_frames, waiting_frames
 from ato_hil.controller import node as controller_node
 from ato_hil.controller.interface import fault_names
 from ato_hil.plant_sim import plant
@@ -42,10 +44,7 @@ TRANSMIT, TRANSMIT_HEAD = 0x10, struct.Struct("<IIIBBH")
 OPERATION = struct.Struct("<II")
 PERIODS_WITHOUT_RUN = 100  # of a plant that arms none
 PROGRESS_TICKS = 500
-HEADER = ("Crc", "Counter", "DataIdNibble")
 MADE_FOR = re.compile(r"(\w+), scenario (\w+)")
-
-FRAME_IDS = [message.frame_id for message in MESSAGES]
 
 Frame = tuple[int, int]  # identifier and payload
 
@@ -81,7 +80,7 @@ class SignalNode:
                 place[f"{message.name}.fresh"],
                 [
                     (place[f"{message.name}.{name}"], getattr(message, name))
-                    for name in signals_of(message)
+                    for name in own_signals(message)
                 ],
             )
             for message in MESSAGES
@@ -127,9 +126,9 @@ def raw_of(word: int, signal: Any) -> int:
     return raw - (1 << signal.length) if signal.is_signed and raw >> (signal.length - 1) else raw
 
 
-def signals_of(message: Any) -> list[str]:
+def own_signals(message: Any) -> list[str]:
     """Names of the signals of a message behind its header."""
-    return [n for n in message._fields[5:] if n not in HEADER]
+    return [name for name in signals_of(message) if name not in HEADER]
 
 
 def transmit(frame: Frame) -> bytes:
@@ -166,7 +165,7 @@ class Controller:
 
     def send(self, _period: int, boxes: Any) -> None:
         """The fresh mailboxes."""
-        self._answer = self._node.exchange(_fresh(boxes))
+        self._answer = self._node.exchange(waiting_frames(boxes))
 
     def receive(self, boxes: Any) -> None:
         """The answer, into mailboxes that are stale."""
@@ -244,7 +243,7 @@ def _opened(
     inputs = [f"{name}.fresh" for name in received]
     for message in MESSAGES:
         if message.name in received:
-            inputs += [f"{message.name}.{signal}" for signal in signals_of(message)]
+            inputs += [f"{message.name}.{signal}" for signal in own_signals(message)]
     outputs = [f"{name}.{what}" for name in sent for what in ("fresh", "payload")]
     fmu = process.start(
         Wanted(
@@ -321,11 +320,11 @@ def _one_run(
         controller.receive(answer)
         tick = len(truths)
         if is_tick:
-            rows += [(tick, *frame) for frame in (*_fresh(boxes), *_fresh(answer))]
+            rows += [(tick, *frame) for frame in (*waiting_frames(boxes), *waiting_frames(answer))]
         elif not truths and silent > PERIODS_WITHOUT_RUN:
             raise FmuError(f"{there.fmu.file}: run {number} does not begin")
         sil.clear(boxes)
-        fill(boxes, there.exchange(_fresh(answer)))
+        fill(boxes, there.exchange(waiting_frames(answer)))
         if is_tick:
             truths.append(tuple(there.outputs[k] for k in truth_at))
             if progress and tick % PROGRESS_TICKS == 0:
@@ -333,9 +332,3 @@ def _one_run(
         elif truths and says == plant.ENDED:
             return rows, truths
     raise AssertionError
-
-
-def _fresh(boxes: Any) -> list[Frame]:
-    """The fresh mailboxes as frames, in the order of sending."""
-    payloads = boxes["payload"].tolist()
-    return [(FRAME_IDS[k], payloads[k]) for k in np.flatnonzero(boxes["fresh"]).tolist()]

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -80,10 +80,7 @@ class InProcess:
 
     def _next(self, made: Generator[Run, None, None]) -> Run | None:
         with self.interrupts.let_through():
-            try:
-                return next(made, None)
-            except FmuError as error:  # what was good when it was checked
-                raise processes.RunError(str(error)) from None
+            return next(made, None)
 
     def tell(self, run: Run) -> None:
         """Frames and facts to the writer."""
@@ -105,12 +102,13 @@ class InProcess:
         memory, firmware = setup.options.memory, setup.options.firmware
         nodes = [node.build(each, memory, firmware) for each in setup.calibrations]
         self.about["controller"] = sizes(nodes[0])
-        for run in in_process.drive(
+        made = in_process.drive(
             *(setup.loaded, nodes, setup.runs, setup.options.seed),
             plan=None if asked is None else asked.bus,
             fails=() if asked is None else asked.plant,
             progress=self.listener.progress,
-        ):
+        )
+        for run in _ended_by_fmu(made):
             yield replace(run, memory=setup.learned(learned_by(nodes[0]))) if setup.words else run
 
 
@@ -123,22 +121,19 @@ class OnTarget(InProcess):
         self.about["controller"] = sizes(node.build(setup.calibrations[0]))
         board = boards.board_of(options.board)
         with pil.targets(options.firmware, board, setup.calibrations) as started:
-            for run in pil.run_line(
+            made = pil.run_line(
                 *(setup.loaded, setup.law, started),
                 runs=setup.runs,
                 seed=options.seed,
                 progress=self.listener.progress,
-            ):
+            )
+            for run in _ended_by_fmu(made):
                 self.about["target"] = pil.about(started, board)
                 yield run
 
 
 class Foreign(InProcess):
     """The same with FMUs in the place of the controllers, of the plant, or of both."""
-
-    def _next(self, made: Generator[Run, None, None]) -> Run | None:
-        with self.interrupts.let_through():
-            return next(made, None)  # an FMU that is not what was asked for is bad input
 
     def _made(self) -> Generator[Run, None, None]:
         setup, options = self.setup, self.setup.options
@@ -168,10 +163,7 @@ class Foreign(InProcess):
                     runs=setup.runs,
                     progress=watch,
                 )
-            try:
-                yield from made
-            except FmuError as error:  # what was good when it began
-                raise processes.RunError(str(error)) from None
+            yield from _ended_by_fmu(made)
 
 
 class Interpreted(InProcess):
@@ -226,6 +218,14 @@ class Interpreted(InProcess):
             )
         file.unlink()
         return run
+
+
+def _ended_by_fmu(made: Iterator[Run]) -> Iterator[Run]:
+    """The runs; raises RunError for an FMU that was good when it was opened."""
+    try:
+        yield from made
+    except FmuError as error:
+        raise processes.RunError(str(error)) from None
 
 
 def sizes(controller: Controller) -> dict[str, int]:

@@ -9,13 +9,11 @@ has to be what the session asks for. However the session ends, the emulator ends
 from __future__ import annotations
 
 import binascii
-import os
 import shutil
 import signal
 import socket
 import struct
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -26,6 +24,7 @@ from typing import IO, Any, Protocol
 
 import numpy as np
 
+from ato_hil.can_dbc import child
 from ato_hil.can_dbc.codec import MESSAGE_COUNT
 from ato_hil.controller import library
 from ato_hil.controller.calibration import Calibration
@@ -62,16 +61,6 @@ ASSUMPTIONS = (
     "layout of mailboxes and state",
     "memory that is zero at the start",
 )
-# Ends with its parent, whatever ends that: then becomes the emulator.
-FOLLOW_PARENT = """
-import ctypes, os, signal, sys
-prctl = getattr(ctypes.CDLL(None), "prctl", None)
-if prctl is not None:
-    prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-if os.getppid() != int(sys.argv[1]):
-    sys.exit(1)
-os.execv(sys.argv[2], sys.argv[2:])
-"""
 
 
 @dataclass(frozen=True)
@@ -248,7 +237,7 @@ def emulated(image: Path, board: Board) -> Iterator[Target]:
             command += ["-chardev", f"socket,id=line,fd={theirs.fileno()}"]
             command += ["-serial", "chardev:line"]
             process = subprocess.Popen(
-                [sys.executable, "-I", "-S", "-c", FOLLOW_PARENT, str(os.getpid()), *command],
+                child.ends_with_parent(command),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
