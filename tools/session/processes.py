@@ -40,7 +40,7 @@ STOPPED_S = 2.0  # a process may be stopped for as long
 SILENCE_S = 10.0  # longest without a word of the plant
 ACCOUNT_TIMEOUT_S = 60.0  # from the end of the last run to every node's account of it
 TRACE_TIMEOUT_S = 30.0  # for the recorder to complete the trace
-LAST_ACCOUNT_S = 2.0  # after Ctrl-C, for all nodes to tell of a run that one has told the end of
+LAST_ACCOUNT_S = 5.0  # after Ctrl-C, for all nodes to tell of a run that one has told the end of
 ASLEEP_S = 1.0  # a wait that took so much longer than asked for: this process was suspended
 
 
@@ -172,6 +172,8 @@ class Bench:
         if event["event"] == "run":
             node.runs[event["run"]] = event
         node.heard_s = self.now_s()
+        if self._interrupts.came:
+            return node, event  # whatever has become of a node: the session ends
         if event["event"] == "error":
             raise RunError(event["message"])
         if event["event"] == "closed":
@@ -183,10 +185,14 @@ class Bench:
         return node, event
 
     def _heed_interrupt(self) -> None:
-        """Raises KeyboardInterrupt after Ctrl-C, when all nodes have told of the last run."""
+        """After Ctrl-C ends the plant, so that no further run begins. Raises KeyboardInterrupt when
+        all nodes have told of the last run."""
         if not self._interrupts.came:
             return
-        self._give_up_s = min(self._give_up_s, self.now_s() + LAST_ACCOUNT_S)
+        if self._give_up_s == float("inf"):
+            self._give_up_s = self.now_s() + LAST_ACCOUNT_S
+            if PLANT in self.nodes:
+                self.nodes[PLANT].process.terminate()
         tellers = self.accountants if self.leader is None else [self.leader, *self.accountants]
         told = {run for node in tellers for run in node.runs}
         whole = all(run in node.runs for node in tellers for run in told)
