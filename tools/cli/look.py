@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.text import Text
 
 from ato_hil.tools.cli import outline
 from ato_hil.tools.cli.console import (
@@ -18,26 +17,22 @@ from ato_hil.tools.cli.console import (
 )
 from ato_hil.tools.cli.options import SEED_MAX, Picture, ScenarioName
 from ato_hil.tools.cli.output import console
+from ato_hil.tools.cli.tables import Column, Row, show
 
 
 def list_scenarios() -> None:
     """List the scenarios and the laws that each has gains for."""
+    headings = ("scenario", "laws (default first)", "what it is; cases: `run SCENARIO:CASE`")
     rows = [
         (name, " ".join(each.laws), f"{each.title}{_cases(each)}")
         for name, each in outline.packaged().items()
     ]
-    headings = ("scenario", "laws (default first)", "what it is; cases: `run SCENARIO:CASE`")
+    if console.is_terminal:
+        show(console, [Column(heading, text=True) for heading in headings], [*map(Row, rows)])
+        return
     names, laws, _what = (max(map(len, column)) for column in zip(headings, *rows, strict=True))
-    lines = [f"{name:<{names}}  {of_it:<{laws}}  {what}" for name, of_it, what in (headings, *rows)]
-    if console.is_terminal and max(map(len, lines)) > console.width:
-        lines = [f"{name:<{names}}  {what}" for name, _laws, what in (headings, *rows)]
-    for line in lines:
-        console.print(
-            Text(line),
-            soft_wrap=not console.is_terminal,
-            no_wrap=True,
-            overflow="ellipsis",
-        )
+    for name, of_it, what in (headings, *rows):  # one line each, for grep
+        say(f"{name:<{names}}  {of_it:<{laws}}  {what}")
 
 
 def _cases(outlined: outline.Outline) -> str:

@@ -84,12 +84,7 @@ def _leasts(columns: Sequence[Column], rows: Sequence[Row]) -> list[int]:
 def _upright(columns: Sequence[Column], rows: Sequence[Row], room: int) -> Table:
     widths = _leasts(columns, rows)
     spare = room - sum(widths) - GAP * (len(columns) - 1)
-    for at, column in enumerate(columns):  # text first: it needs fewer lines then
-        if column.text:
-            wanted = max((cell_len(row.cells[at]) for row in rows), default=0)
-            more = min(spare, max(0, wanted - widths[at]))
-            widths[at] += more
-            spare -= more
+    spare -= _widen(widths, columns, rows, spare)  # text first: it needs fewer lines then
     for at, column in enumerate(columns):
         more = min(spare, max(0, max(map(cell_len, column.heading.split("\n"))) - widths[at]))
         widths[at] += more
@@ -104,11 +99,28 @@ def _upright(columns: Sequence[Column], rows: Sequence[Row], room: int) -> Table
     return table
 
 
+def _widen(widths: list[int], columns: Sequence[Column], rows: Sequence[Row], spare: int) -> int:
+    """Gives the room that is left to texts, always to what takes most lines; how much it gave."""
+    wanted = {
+        at: max((cell_len(row.cells[at]) for row in rows), default=0)
+        for at, column in enumerate(columns)
+        if column.text
+    }
+    for given in range(spare):
+        narrow = [at for at in wanted if wanted[at] > widths[at]]
+        if not narrow:
+            return given
+        widths[max(narrow, key=lambda at: wanted[at] / widths[at])] += 1
+    return spare
+
+
 def _turned(
     console: PlainConsole, columns: Sequence[Column], rows: Sequence[Row], room: int
 ) -> None:
     names = [" ".join(column.heading.split()) for column in columns]
-    label = min(max(map(cell_len, names), default=0), room // 2 - GAP)
+    words = [cell_len(word) for row in rows for cell in row.cells for word in cell.split()]
+    widest = min(LONGEST_WORD, max(words, default=0))
+    label = min(max(map(cell_len, names), default=0), room // 2 - GAP, room - GAP - widest)
     left = room - label - GAP
     start = 0
     while start < len(rows):

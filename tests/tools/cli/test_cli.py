@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 from typer.testing import CliRunner
 
 from ato_hil.can_dbc.child import python
 from ato_hil.plant_sim.scenario import load, scenario_names
-from ato_hil.tools.cli import look, main, outline
+from ato_hil.tools.cli import console, look, main, outline
+from ato_hil.tools.cli.output import PlainConsole
 
 
 def test_list_names_every_scenario(ato_hil, tmp_path: Path) -> None:
@@ -51,16 +51,30 @@ def test_the_list_loads_no_compiler(ato_hil, tmp_path: Path) -> None:
     assert len(lines) == 2 + len(scenario_names())  # one a scenario, cases folded
 
 
-@pytest.mark.parametrize("width", [40, 80])
-def test_a_narrow_list_keeps_one_line_a_scenario(
-    monkeypatch: pytest.MonkeyPatch, width: int
-) -> None:
-    screen = Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
+def of_list(screen: PlainConsole, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.setattr(look, "console", screen)
+    monkeypatch.setattr(console, "console", screen)
     look.list_scenarios()
-    lines = screen.file.getvalue().splitlines()  # type: ignore[attr-defined]
-    assert max(map(len, lines)) <= width
-    assert [line.split()[0] for line in lines[1:]] == scenario_names()
+    return screen.file.getvalue()  # type: ignore[attr-defined, no-any-return]
+
+
+@pytest.mark.parametrize("width", [40, 80, 120])
+def test_the_list_cuts_no_name_on_any_terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    screen = PlainConsole(width=width, force_terminal=True, color_system=None, file=io.StringIO())
+    text = of_list(screen, monkeypatch)
+    assert max(map(len, text.splitlines())) <= width
+    words = set(text.split())
+    for name, outlined in outline.packaged().items():
+        assert {name, *outlined.laws, *outlined.cases} <= words
+
+
+def test_the_list_for_a_pipe_has_a_whole_line_a_scenario(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = PlainConsole(width=40, force_terminal=False, file=io.StringIO())
+    _heading, *lines = of_list(screen, monkeypatch).splitlines()
+    for line, (name, outlined) in zip(lines, outline.packaged().items(), strict=True):
+        assert line.startswith(f"{name} ")
+        assert f" {' '.join(outlined.laws)} " in line
+        assert line.endswith(" ".join([outlined.title, *outlined.cases][-1:]))
 
 
 def test_the_version_is_that_of_the_package(ato_hil, tmp_path: Path) -> None:
