@@ -221,8 +221,8 @@ def check_processes(law: str) -> Iterator[Row]:
     for name, reason in missing:
         yield Row("same bits on a bus", law, f"three processes on {name}", reason, ABSENT)
     with tempfile.TemporaryDirectory(prefix="ato-hil-verify-") as scratch:
-        for variant in variants(Path(scratch), have):
-            yield _check_variant(variant, scenario, law, expected, Path(scratch) / "out")
+        for number, variant in enumerate(variants(Path(scratch), have)):
+            yield _check_variant(variant, scenario, law, expected, Path(scratch) / f"{number}")
 
 
 def _check_variant(variant: Variant, scenario: str, law: str, expected: str, out: Path) -> Row:

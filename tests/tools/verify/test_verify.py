@@ -328,3 +328,10 @@ def test_growth_is_seen(monkeypatch):
     controller = node.build(onboard.calibration_for(load("subway-paper"), "pid"))
     traced, _resident = footprint.growth(controller, 5000)
     assert traced > footprint.TRACED_GROWTH_MAX
+
+
+def test_the_same_run_is_made_again_in_several_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    some = identity.variants(Path("unused"), [])[:2]
+    monkeypatch.setattr(identity, "variants", lambda *_: some)
+    rows = [row for row in identity.check_processes("pid") if row.name == "same bits"]
+    assert [(row.state, row.result) for row in rows] == [(PASSED, rows[0].result)] * 2

@@ -8,6 +8,7 @@ import pytest
 
 from ato_hil.controller.registry import law_names
 from ato_hil.tools.verify import (
+    ABSENT,
     PASSED,
     accuracy,
     cost,
@@ -29,6 +30,12 @@ def test_fixed_point_is_near_float64(law):
 def test_the_whole_tick_is_integers_only(law):
     row = table.check_tick_code(law)
     assert row.state == PASSED, row.result
+
+
+def test_every_process_bus_and_cache_gives_the_same_bits():
+    rows = [row for row in identity.check_processes("pid") if row.state != ABSENT]
+    assert [row for row in rows if row.state != PASSED] == []
+    assert len(rows) >= 6
 
 
 def test_golden_digests_hold():
