@@ -11,6 +11,7 @@ import typer
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     EXIT_ENDED_EARLY,
+    counted,
     fail,
     one_line_for_bad_input,
     say,
@@ -47,7 +48,7 @@ def replay(
         prepared = open_loop.prepare(recording, scenario, law, memory, channel)
         say(
             f"{prepared.loaded.name}, {law_label(prepared.calibration.law)}:"
-            f" {len(prepared.runs)} runs",
+            f" {counted(len(prepared.runs), 'run')}",
         )
         for note in prepared.notes:
             say(note, "dim")
@@ -205,10 +206,10 @@ def bench(
     from ato_hil.tools.bench import bench as rates
     from ato_hil.tools.bench import pingpong
 
-    say("what is measured has the machine to itself: this takes minutes", "dim")
     if parts:
         _print_parts(parts)
         return
+    say("what is measured has the machine to itself: this takes minutes", "dim")
     buses = bus or ["hub:bench"]
     if campaign is not None:
         _bench_campaign(campaign)

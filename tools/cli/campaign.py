@@ -17,6 +17,7 @@ from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     EXIT_ENDED_EARLY,
     EXIT_INTERRUPTED,
+    counted,
     fail,
     one_line_for_bad_input,
     say,
@@ -76,7 +77,7 @@ def campaign(
             raise fail("--workers: the cluster has its own", EXIT_BAD_INPUT)
         asked = campaign_file.read(file)
         total = runner.check(asked, lambda text: say(text, "dim"))
-        say(f"{asked.title}: {total:,} runs in {asked.sessions:,} sessions")
+        say(f"{asked.title}: {counted(total, 'run')} in {counted(asked.sessions, 'session')}")
         who = partial(spread.spread, workers=workers)
         if dask is not None:
             who = partial(on_dask.spread, address=dask, workers=workers)
@@ -182,7 +183,8 @@ def _print(ended: Conclusion, folder: Path) -> None:
 
 def _print_statistics(found: Statistics) -> None:
     for group in found.groups:
-        title = f"{group.name}: {group.runs:,} runs of {group.sessions:,} sessions"
+        title = f"{group.name}: {counted(group.runs, 'run')}"
+        title += f" of {counted(group.sessions, 'session')}"
         title += f", {group.cut:,} of them ended early" if group.cut else ""
         _print_spreads(group, title, [f"{100 * q:g} %" for q in found.quantiles])
         _print_bounds(group)

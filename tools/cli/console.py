@@ -19,6 +19,11 @@ EXIT_NOT_CONTROLLED = 5
 EXIT_INTERRUPTED = 130
 
 
+def counted(number: int, what: str) -> str:
+    """So many of something: 1 run, 1,200 runs."""
+    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
+
+
 def say(text: str, style: str = "") -> None:
     """One line of output, whatever its length. It may hold what comes from a user: a name with
     brackets or colons is no markup."""

@@ -10,6 +10,7 @@ import typer
 from ato_hil.tools.cli import outline
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
+    counted,
     fail,
     one_line_for_bad_input,
     say,
@@ -158,7 +159,7 @@ def figures(
             say(f"{drawn.stem}: {drawn.caption}")
     if not files:
         raise fail("nothing could be drawn", EXIT_BAD_INPUT)
-    say(f"{len(files)} files in {target}")
+    say(f"{counted(len(files), 'file')} in {target}")
 
 
 def report(

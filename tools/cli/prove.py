@@ -14,6 +14,7 @@ from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
     EXIT_ENDED_EARLY,
     EXIT_INTERRUPTED,
+    counted,
     fail,
     one_line_for_bad_input,
     say,
@@ -252,7 +253,7 @@ def noise(
         raise fail(str(error), EXIT_ENDED_EARLY) from None
     kinds = ", ".join(f"{count:,} {kind}" for kind, count in found.kinds.items())
     say(f"random frames sent   {found.frames:,} ({kinds})")
-    say(f"beside               {found.runs} runs, {found.ticks:,} ticks")
+    say(f"beside               {counted(found.runs, 'run')}, {found.ticks:,} ticks")
     say(f"ticks changed        {found.changed}")
     say(f"runs with a fault    {found.stopped} ({', '.join(found.faults) or 'none'})")
     say(f"expected to be taken {found.expected_taken:.2g} frames")

@@ -18,6 +18,7 @@ from ato_hil.tools.cli.console import (
     EXIT_INTERRUPTED,
     EXIT_NOT_AS_EXPECTED,
     EXIT_NOT_CONTROLLED,
+    counted,
     fail,
     one_line_for_bad_input,
     say,
@@ -93,7 +94,8 @@ class Screen:
         self.runs, self.ticks = runs, loaded.ticks
         self.title = f"{loaded.name}, {law}, {self.mode.value}"
         say(
-            f"{loaded.scenario.title}: law {law}, {len(runs)} runs of {loaded.ticks} ticks,"
+            f"{loaded.scenario.title}: law {law}, {counted(len(runs), 'run')} of"
+            f" {loaded.ticks} ticks,"
             f" {self.mode.value}",
         )
         size = len(runs) * loaded.ticks * loaded.trains * self.bytes_per_tick
@@ -102,9 +104,8 @@ class Screen:
             say(text, "yellow")
         minutes = self._seconds(len(runs) * loaded.ticks * loaded.trains, loaded) / 60
         if minutes > LONG_MINUTES:
-            say(
-                f"this will take about {minutes:.0f} minutes; --runs 1 makes a single run", "yellow"
-            )
+            fewer = "; --runs 1 makes a single run" if len(runs) > 1 else ""
+            say(f"this will take about {minutes:.0f} minutes{fewer}", "yellow")
         say_if_compiling()
         self.task = self.bar.add_task(
             "run",
@@ -148,11 +149,14 @@ class Screen:
         )
         if not console.is_terminal:
             for shown in shown_rows(row):
-                cells = [
-                    f"{name.split(chr(10))[0]} {cell(shown, key, f, s)}"
-                    for name, key, f, s in columns_of(row)
-                ]
+                cells = [_said(shown, *column) for column in columns_of(row)]
                 say("  ".join([*cells, faults_of(shown)]).rstrip())
+
+
+def _said(row: dict[str, Any], heading: str, key: str, factor: float, form: str) -> str:
+    """A value with its name and unit, for lines."""
+    name, _, unit = heading.partition("\n")
+    return f"{name} {cell(row, key, factor, form)} {unit}".rstrip()
 
 
 def _print_table(screen: Screen) -> None:

@@ -30,7 +30,7 @@ LINE_COLUMNS = (
     ("least separation\nm", "min_separation_m", 1, "{:.2f}"),
     ("largest separation\nm", "max_separation_m", 1, "{:.2f}"),
     ("to the barrier\nmm", "min_barrier_distance_m", 1e3, "{:.1f}"),
-    ("string\namplification", "string_amplification", 1, "{:.3f}"),
+    ("string amplification", "string_amplification", 1, "{:.3f}"),
     COLUMNS[7],
     COLUMNS[-1],
 )

@@ -12,7 +12,7 @@ from ato_hil.can_dbc import step
 from ato_hil.plant_sim.scenario import load
 from ato_hil.tools.cli import console, run
 from ato_hil.tools.cli.options import Mode, Pace
-from ato_hil.tools.runs import expect
+from ato_hil.tools.runs import columns, expect
 from ato_hil.tools.runs.expect import ExpectError, parse, unmet
 from ato_hil.tools.session import sil
 from ato_hil.tools.trace.budget import BYTES_OF_TICK
@@ -126,3 +126,26 @@ def test_what_takes_minutes_says_so_first(screen: io.StringIO) -> None:
     assert screen.getvalue().count("this will take about") == 1
     run.Screen(Mode.hil, pace=Pace.realtime).begin(loaded, "cailc", range(1, 11))
     assert "this will take about 32 minutes" in screen.getvalue()
+
+
+def test_a_single_run_is_not_told_to_be_fewer(screen: io.StringIO) -> None:
+    run.Screen(Mode.hil, pace=Pace.realtime).begin(load("subway"), "cailc", range(1, 2))
+    assert "1 run of 19001 ticks" in screen.getvalue()
+    assert "this will take about 3 minutes\n" in screen.getvalue()
+
+
+def test_a_pipe_gets_every_number_with_its_unit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    screen = io.StringIO()
+    for module in (console, run):
+        monkeypatch.setattr(module, "console", Console(width=80, file=screen))
+    here = run.Screen(Mode.sil)
+    here.begin(load("subway"), "cailc", range(1, 3))
+    row = {key: 0.0123 for _name, key, _factor, form in columns.COLUMNS if "d" not in form}
+    here.row({**row, "run": 1, "faults": ["overspeed"], "ticks_per_s": 1e6})
+    assert "position error 12.300 mm" in screen.getvalue()
+    assert "energy 0.0123 kWh/t  ticks/s 1,000,000  overspeed" in screen.getvalue()
+    assert "string amplification 0.5" in run._said(
+        {"string_amplification": 0.5}, *columns.LINE_COLUMNS[-3]
+    )
