@@ -21,6 +21,7 @@ from ato_hil.tools.session.options import Options, check
 from ato_hil.tools.session.spread import Lost, cores, spread
 from ato_hil.tools.trace import facts
 from ato_hil.tools.trace.budget import trace_writer
+from ato_hil.tools.trace.writer import TraceError
 
 FOLDER = "worst"
 TRACE = "trace.rrd"
@@ -56,8 +57,9 @@ def repeat(
     progress(f"the {len(tasks)} worst runs again, for their traces")
     with closing(spread(make, tasks, min(cores(), len(tasks)))) as made:
         for at, digest in made:
-            if isinstance(digest, Lost):
-                problems.append(f"{worst[at].trace}: its process was killed")
+            if isinstance(digest, Lost | TraceError):
+                killed = f"{worst[at].trace}: its process was killed"
+                problems.append(killed if isinstance(digest, Lost) else str(digest))
                 worst[at].trace = ""
             elif digest != worst[at].digest:
                 problems.append(f"{worst[at].command}: digest {digest}, was {worst[at].digest}")
@@ -89,8 +91,17 @@ def _command(asked: Job, run: int, work: Path, final: Path) -> str:
     return shlex.join(placed)
 
 
-def make(again: Again) -> str:
-    """Makes the runs of a job up to one, and the trace of that; returns the digest so far."""
+def make(again: Again) -> str | TraceError:
+    """Makes the runs of a job up to one, and the trace of that; returns the digest so far, or why
+    there is no trace: the others are made all the same."""
+    try:
+        return _made(again)
+    except TraceError as error:
+        Path(again.folder, TRACE).unlink(missing_ok=True)
+        return error
+
+
+def _made(again: Again) -> str:
     asked, folder = again.job, Path(again.folder)
     options = Options(
         scenario=asked.scenario,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from ato_hil.can_dbc.errors import InputError
 from ato_hil.tools.cli import places
 from ato_hil.tools.cli.console import (
     EXIT_BAD_INPUT,
@@ -20,6 +22,7 @@ from ato_hil.tools.cli.console import (
     counted,
     fail,
     one_line_for_bad_input,
+    refused,
     say,
     say_if_compiling,
     working,
@@ -90,17 +93,18 @@ def campaign(
             else:
                 runner.check_resumed(asked, place.work)
             say_if_compiling()
-            with Meter(total) as meter:
-                outcome = runner.run(asked, place.work, who, meter.update)
-            with working("") as update:
-                ended = runner.conclude(asked, outcome, place.work, place.final, update)
-                campaign_page.write(place.work, asked, ended)
+            with _to_go_on(file, place.work):
+                with Meter(total) as meter:
+                    outcome = runner.run(asked, place.work, who, meter.update)
+                with working("") as update:
+                    ended = runner.conclude(asked, outcome, place.work, place.final, update)
+                    campaign_page.write(place.work, asked, ended)
             if not outcome.whole:
                 _print(ended, place.work)
                 _end_early(outcome, file, place.work)
     _print(ended, place.final)
     if ended.problems:
-        raise fail("; ".join(ended.problems), EXIT_ENDED_EARLY)
+        raise fail("; ".join([*ended.problems, _again(file, place.final)]), EXIT_ENDED_EARLY)
     if ended.statistics is not None and ended.statistics.failed:
         failed = f"{ended.statistics.failed} sessions cannot run, their rows say why"
         raise fail(f"{failed}; {outcome.error}" if outcome.error else failed, EXIT_BAD_INPUT)
@@ -118,10 +122,28 @@ def _place(
         yield place
 
 
+def _again(file: Path, folder: Path) -> str:
+    """How what is missing is made."""
+    return f"go on: {shlex.join(['ato-hil', 'campaign', str(file), '--resume', str(folder)])}"
+
+
+@contextmanager
+def _to_go_on(file: Path, folder: Path) -> Iterator[None]:
+    """Says of whatever ends a campaign how it goes on. Raises typer.Exit."""
+    again = _again(file, folder)
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise fail(f"interrupted; {again}", EXIT_INTERRUPTED) from None
+    except InputError as error:
+        raise fail(f"{error}; {again}", EXIT_BAD_INPUT) from None
+    except OSError as error:
+        raise fail(f"{refused(error)}; {again}", EXIT_ENDED_EARLY) from None
+
+
 def _end_early(outcome: Any, file: Path, folder: Path) -> None:
-    """Says how to go on. Raises typer.Exit."""
-    again = f"ato-hil campaign {file} --resume {folder}"
-    text = f"{outcome.runs:,} runs are in {folder}; go on: {again}"
+    """Says what there is. Raises typer.Exit."""
+    text = f"{outcome.runs:,} runs are in {folder}; {_again(file, folder)}"
     if outcome.interrupted:
         raise fail(f"interrupted; {text}", EXIT_INTERRUPTED)
     raise fail(f"{'; '.join(outcome.lost)}; {text}", EXIT_ENDED_EARLY)
@@ -176,8 +198,8 @@ def _print(ended: Conclusion, folder: Path) -> None:
     """Tables and places."""
     if ended.statistics is not None:
         _print_statistics(ended.statistics)
-    say(f"digest  {ended.digest}")
-    say(f"rows    {folder / 'rows.parquet'}")
+        say(f"digest  {ended.digest}")
+        say(f"rows    {folder / 'rows.parquet'}")
     say(f"report  {folder / 'report.html'}")
 
 

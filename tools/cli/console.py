@@ -53,6 +53,14 @@ def fail(message: str, code: int) -> typer.Exit:
     return typer.Exit(code)
 
 
+def refused(error: Exception) -> str:
+    """What the system refuses, with the file that it is about."""
+    file = getattr(error, "filename", None)
+    where = f"{file}: " if file else ""
+    reason = getattr(error, "strerror", None) or str(error) or "there is no more memory"
+    return f"{where}{reason}"
+
+
 @contextmanager
 def one_line_for_bad_input() -> Iterator[None]:
     """Bad input of every kind is one line and an exit status, no traceback; so are a step that the

@@ -22,7 +22,7 @@ from ato_hil.tools.cli import (
     run,
     scenarios,
 )
-from ato_hil.tools.cli.console import EXIT_ENDED_EARLY, end_as_with_ctrl_c, fail, say
+from ato_hil.tools.cli.console import EXIT_ENDED_EARLY, end_as_with_ctrl_c, fail, refused, say
 from ato_hil.tools.cli.options import Viewer
 from ato_hil.tools.cli.output import ignore_other_tools, streams
 from ato_hil.tools.runs.limits import limit
@@ -116,10 +116,7 @@ def main() -> None:
         except (OSError, MemoryError, ImportError) as error:  # what the system refuses
             if isinstance(error, ImportError) and limit(resource.RLIMIT_AS) == float("inf"):
                 raise
-            file = getattr(error, "filename", None)
-            where = f"{file}: " if file else ""
-            reason = getattr(error, "strerror", None) or str(error) or "there is no more memory"
-            fail(f"{where}{reason}", EXIT_ENDED_EARLY)
+            fail(refused(error), EXIT_ENDED_EARLY)
             sys.exit(EXIT_ENDED_EARLY)
 
 

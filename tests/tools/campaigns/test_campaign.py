@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -27,8 +28,10 @@ from ato_hil.can_dbc.errors import InputError
 from ato_hil.tools.campaigns import campaign, campaign_file, distributions, rows, worst
 from ato_hil.tools.campaigns.campaign_file import Campaign, CampaignError, read
 from ato_hil.tools.campaigns.varied import Varied
+from ato_hil.tools.cli import campaign as at_console
 from ato_hil.tools.reports import campaign_page
 from ato_hil.tools.session.spread import Lost, spread
+from ato_hil.tools.trace.writer import TraceError
 
 FAULTS = '[[bus]]\nkind = "drop"\nmessages = ["TRAIN_SPEED"]\nprobability = 0.02\n'
 ROOT = Path(__file__).resolve().parents[3]
@@ -477,7 +480,45 @@ def test_the_example_runs_as_it_is(ato_hil: Any, tmp_path: Path) -> None:
     assert len(content["statistics"]["groups"]) == 4
 
 
+def test_a_trace_that_the_disk_does_not_take_is_named_and_the_rest_is_there(
+    file: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
+    def cut_off(again: worst.Again) -> str:
+        Path(again.folder, worst.TRACE).write_bytes(b"RRF2")
+        raise TraceError(f"{again.folder}/{worst.TRACE}: the trace is incomplete: disk full")
+
+    monkeypatch.setattr(worst, "_made", cut_off)
+    monkeypatch.setattr(worst, "spread", lambda function, tasks, _workers: here(function, tasks))
+    ended = made(read(file), tmp_path / "o")
+    assert ended.problems == [
+        f"{tmp_path}/o/worst/01/trace.rrd: the trace is incomplete: disk full"
+    ]
+    assert ended.statistics is not None
+    (again,) = ended.statistics.worst
+    assert (again.command != "", again.trace) == (True, "")
+    assert not (tmp_path / "o" / "worst" / "01" / worst.TRACE).exists()
+    assert json.loads((tmp_path / "o" / campaign.FILE).read_text())["whole"] is True
+
+
 # The command.
+
+
+@pytest.mark.parametrize(
+    ("error", "says", "status"),
+    [
+        (KeyboardInterrupt(), "interrupted", 130),
+        (CampaignError("c.toml: key bounds: no"), "c.toml: key bounds: no", 1),
+        (OSError(28, "disk full", "o/parts/1"), "o/parts/1: disk full", 3),
+    ],
+)
+def test_whatever_ends_it_says_how_to_go_on(
+    error: BaseException, says: str, status: int, capsys: Any
+) -> None:
+    with pytest.raises(typer.Exit) as ended, at_console._to_go_on(Path("c.toml"), Path("my o")):
+        raise error
+    assert ended.value.exit_code == status
+    said = f"ato-hil: {says}; go on: ato-hil campaign c.toml --resume 'my o'"
+    assert capsys.readouterr().err.strip() == said
 
 
 def test_errors_of_the_command_are_one_line(ato_hil: Any, tmp_path: Path) -> None:
