@@ -149,7 +149,7 @@ def held_values(at: np.ndarray, values: np.ndarray, ticks: int) -> np.ndarray:
     the first one, the first; all 0 if there is none."""
     if not len(at):
         return np.zeros(ticks)
-    latest = np.searchsorted(at, np.arange(ticks), side="right") - 1
+    latest = np.cumsum(np.bincount(at, minlength=ticks)[:ticks]) - 1
     return np.asarray(values[np.maximum(latest, 0)])
 
 

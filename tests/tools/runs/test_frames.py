@@ -25,6 +25,7 @@ from ato_hil.tools.runs.frames import (
     columns,
     decode,
     estimate,
+    held_values,
 )
 
 WORDS = st.integers(-(2**63), 2**63 - 1)
@@ -136,3 +137,19 @@ def test_an_estimate_is_its_mantissa_times_two_to_minus_the_exponent(sent) -> No
         ticks, values = estimate(frames, index)
         expected = [(k, raw / 2**n) for k, (i, n, raw) in enumerate(sent) if i == index]
         assert list(zip(ticks.tolist(), values.tolist(), strict=True)) == expected
+
+
+@given(
+    st.lists(st.integers(0, 30), min_size=1, max_size=40).map(sorted),
+    st.integers(1, 30),
+)
+def test_a_value_is_held_until_the_next(at: list[int], ticks: int) -> None:
+    held = held_values(np.array(at, np.int32), np.arange(float(len(at))), ticks)
+    last = [
+        max([i for i, each in enumerate(at) if each <= tick], default=0) for tick in range(ticks)
+    ]
+    assert held.tolist() == last
+
+
+def test_what_was_never_sent_is_zero() -> None:
+    assert held_values(np.zeros(0, np.int32), np.zeros(0), 3).tolist() == [0.0, 0.0, 0.0]
