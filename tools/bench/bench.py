@@ -1,23 +1,22 @@
-"""How fast the bench is, as ratios to a peer in the same run: HIL against a bare python-can echo,
-SIL against python-control."""
+"""How fast the bench is, as ratios to a peer in the same run: HIL against a bare python-can echo of
+its frames, SIL against python-control. What can disturb a pair is measured in turns, the best of
+each counts: what else the machine does only slows them."""
 
 from __future__ import annotations
 
-import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import can
 import numpy as np
 
-from ato_hil.can_dbc.bus import choose_bus, open_bus
-from ato_hil.can_dbc.child import python
 from ato_hil.plant_sim.scenario import load
+from ato_hil.tools.bench import echo
 from ato_hil.tools.export import ExportError, closed_loop
 from ato_hil.tools.session import in_process, session
 from ato_hil.tools.session.options import Silent
@@ -27,8 +26,7 @@ SCENARIO = "subway-fast"
 HIL_SCENARIO = "subway"
 LEARNING_SCENARIO = "crh3-learning"
 TICKS_OF_PEER = 4000
-# What HIL moves in a tick of `subway`: frames to the controller, frames back.
-FRAMES_THERE, FRAMES_BACK = 3, 4
+TURNS = 3
 
 
 @dataclass(frozen=True)
@@ -53,21 +51,29 @@ def measure(bus: str) -> Iterator[Figure]:
     what = "SIL, whole chain, traces off"
     yield Figure(what, sil_rate(), name, peer)
     with suppress(ExportError):  # without a C compiler there is none
-        # In turns, the better of each: what else the machine does only slows them.
-        turns = [(sil_rate(), c_rate()) for _ in range(3)]
-        fastest = [max(rates) for rates in zip(*turns, strict=True)]
-        yield Figure(what, fastest[0], "whole chain in C, gcc -O3", fastest[1])
+        yield Figure(what, *_with_peer(sil_rate, "whole chain in C, gcc -O3", c_rate))
     yield Figure("SIL, 250 000 ticks a run, whole session", session_rate(), name, peer)
-    echo = "bare python-can echo"
-    yield Figure("HIL, three processes, trace on", hil_rate(bus), echo, echo_rate(bus))
+    frames = echo.frames_of(HIL_SCENARIO, TICKS_OF_PEER)
+    bare = partial(echo.rate, bus, frames)
+    with_echo = _with_peer(partial(hil_rate, bus), "bare python-can echo of its frames", bare)
+    yield Figure("HIL, three processes, trace on", *with_echo)
     with suppress(live_viewer.ViewerError):  # without a viewer there is nothing to measure
         alone, watched = watched_rates(bus)
         yield Figure("HIL, viewer looking on", watched, "HIL without it", alone)
 
 
+def _with_peer(
+    ours: Callable[[], float], peer: str, theirs: Callable[[], float]
+) -> tuple[float, str, float]:
+    """Rate, peer and its rate, as a Figure has them. Raises what they raise."""
+    turns = [(ours(), theirs()) for _ in range(TURNS)]
+    fastest, of_peer = (max(rates) for rates in zip(*turns, strict=True))
+    return fastest, peer, of_peer
+
+
 def watched_rates(bus: str) -> tuple[float, float]:
     """Rates of HIL without and with a viewer that draws what comes, ticks/s: the better of two
-    sessions each, in turns; what else the machine does only slows them."""
+    sessions each."""
     alone, watched = [], []
     for _ in range(2):
         alone.append(hil_rate(bus))
@@ -164,42 +170,3 @@ def hil_rate(bus: str, viewer: live_viewer.LiveView | None = None) -> float:
         )
         summary = session.run(options, Silent())
     return float(np.median([row["ticks_per_s"] for row in summary["runs"]]))
-
-
-def echo_rate(bus: str) -> float:
-    """As many frames there and back as in HIL, by python-can's own send and recv, without any
-    control."""
-    name = choose_bus(bus).name
-    child = subprocess.Popen(
-        python("-c", f"from ato_hil.tools.bench.bench import echo; echo({name!r})"),
-        stdout=subprocess.PIPE,
-    )
-    assert child.stdout is not None
-    child.stdout.readline()
-    messages = [
-        can.Message(arbitration_id=i, data=bytes(8), is_extended_id=False) for i in range(3)
-    ]
-    try:
-        with open_bus(name) as here:
-            started = time.perf_counter()
-            for _ in range(TICKS_OF_PEER):
-                for message in messages:
-                    here.send(message)
-                for _answer in range(FRAMES_BACK):
-                    here.recv(1.0)
-            return TICKS_OF_PEER / (time.perf_counter() - started)
-    finally:
-        child.kill()
-        child.wait()
-
-
-def echo(name: str) -> None:
-    """The other end of `echo_rate`: answers every third frame with four."""
-    answer = can.Message(arbitration_id=0x100, data=bytes(8), is_extended_id=False)
-    with open_bus(name) as bus:
-        print("ready", flush=True)
-        while True:
-            for _ in range(FRAMES_THERE):
-                bus.recv()
-            for _ in range(FRAMES_BACK):
-                bus.send(answer)
