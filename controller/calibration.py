@@ -30,6 +30,7 @@ from ato_hil.controller import (
     plausibility,
     rebasing,
     reference,
+    yielding,
 )
 from ato_hil.controller.q import (
     INT32_MAX,
@@ -95,10 +96,12 @@ def calibrate(
     map_sections: Sequence[tuple[float, float, float]] = (),
     start_m: float = 0.0,
     line: Line | None = None,
+    yielding_settings: yielding.YieldingSettings | None = None,
     scenario_digest: str,
 ) -> Calibration:
     """PARAMS of the firmware for one law on one scenario; `start_m` is where the timetable starts,
-    with `atp_releases` ATP's emergency brake ends at the permitted speed. Raises CalibrationError
+    with `atp_releases` ATP's emergency brake ends at the permitted speed, with `yielding_settings`
+    the timetable yields to what it permits. Raises CalibrationError
     or LawError with one line."""
     known = load_law(law)
     params = np.zeros(1, firmware.params_dtype(known.PARAMS))
@@ -138,6 +141,8 @@ def calibrate(
         _line(params, line, start_m, vehicle.period_s)
     else:
         params["neighbours"]["start"] = fixed("the start of the timetable", start_m, Q_POSITION)
+    if yielding_settings is not None:
+        params["yielding"] = yielding.calibrate(yielding_settings, vehicle.period_s)
     params["memory"] = memory.calibrate(words, memory_settings, ticks)
     if recall is not None:
         memory.calibrate_recall(params["memory"], recall)

@@ -58,6 +58,7 @@ from ato_hil.controller import (
     plausibility,
     rebasing,
     reference,
+    yielding,
 )
 from ato_hil.controller.interface import (
     AHEAD,
@@ -135,7 +136,7 @@ CORE_STATE = np.dtype(
         ("map_section", np.int32),  # of the gradient map
         ("stamp", np.int32),  # Tick of the last TRAIN_POSITION
         ("measured", np.int32),  # position in it, m, Q15
-        ("padding", np.int32),
+        ("waits", np.int32),  # 1: the timetable is inside the same tick as before
         ("car_force", np.int32, (distribution.CARS_MAX,)),  # N Q4
         # Next end-to-end counter of each message sent; an even number, so that nothing is padded.
         ("sent", np.int32, (MESSAGE_COUNT + MESSAGE_COUNT % 2,)),
@@ -149,6 +150,7 @@ CORE_BOUNDS = {
     "tick": (0, INT32_MAX),
     "map_section": (0, gradient_map.SECTIONS_MAX),
     "stamp": (0, TICK_MASK),
+    "waits": (0, 1),
     "sent": (0, e2e.COUNTER_PERIOD - 1),
 }
 
@@ -178,6 +180,7 @@ def params_dtype(law_params: np.dtype) -> np.dtype:
             ("gradient_map", gradient_map.PARAMS),
             ("neighbours", neighbours.PARAMS),
             ("rebasing", rebasing.PARAMS),
+            ("yielding", yielding.PARAMS),
             ("memory", memory.MEMORY_PARAMS),
             ("distribution", distribution.PARAMS),
             ("law", law_params),
@@ -240,6 +243,7 @@ def begin(params: Record, profile: Array, state: Record, cells: Array, rate: Int
     core.force = 0
     core.map_section = 0
     core.stamp = 0
+    core.waits = 0
     core.measured = sat32(reference.position(state.cursor) + int64(params.neighbours.start))
     for i in range(MESSAGE_COUNT):
         core.sent[i] = 0
@@ -543,7 +547,8 @@ def before_law(
     stands = int64(inputs.reference_speed) == 0 and int64(inputs.ahead_speed) == 0
     state.seen.timetable_stands = 1 if stands else 0
     way = int64(inputs.position) - int64(params.neighbours.start)
-    memory.gather(params.memory, state.memory, cells, state.cell, way)
+    if int64(core.waits) == 0:
+        memory.gather(params.memory, state.memory, cells, state.cell, way)
     return int64(1)
 
 
@@ -555,9 +560,23 @@ def after_law(params: Record, profile: Array, state: Record, cells: Array, tx: A
     memory.scatter(params.memory, state.memory, cells, state.cell)
     command(params, state)
     send(params, state, tx)
+    if int64(params.yielding.enabled) != 0:
+        give_way(params, state)
     reference.advance(params.reference, state.cursor, profile)
     reference.advance(params.reference, state.ahead, profile)
     core.tick = min(int64(core.tick) + 1, int64(INT32_MAX))  # after 248 days
+
+
+@step
+def give_way(params: Record, state: Record) -> None:
+    """The pace at which the reference goes on, where ATP permits less than the timetable's."""
+    core = state.core
+    cursor = state.cursor
+    if yielding.follow(params.yielding, params.reference, cursor, state.seen, state.inputs) != 0:
+        core.faults = int64(core.faults) | FAULT_REBASED
+    state.ahead.rate = int64(cursor.rate)
+    state.ahead.slope = int64(cursor.slope)
+    core.waits = 1 if int64(cursor.phase) + int64(cursor.rate) < 0 else 0
 
 
 @step

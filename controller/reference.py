@@ -42,8 +42,8 @@ CURSOR = np.dtype(
         ("left", np.int32),  # ticks left in it; 0 at the end of the table
         ("jerk", np.int32),  # of this tick
         ("phase", np.int32),  # part of this tick that is over, Q24
-        ("rate", np.int32),  # of the timetable, less 1, Q24, -1/2 to 1/2
-        ("padding", np.int32),
+        ("rate", np.int32),  # of the timetable, less 1, Q24, -1 to 1/2
+        ("slope", np.int32),  # its change since the tick before, Q24
     ],
     align=True,
 )
@@ -88,7 +88,8 @@ def cursor_bounds(params: Any) -> dict[str, tuple[int, int]]:
         "segment": (0, max(int(params["segment_count"]) - 1, 0)),
         "left": (0, INT32_MAX),
         "phase": (0, ONE - 1),
-        "rate": (-(ONE >> 1), ONE >> 1),
+        "rate": (-ONE, ONE >> 1),
+        "slope": (-ONE, ONE),
     }
 
 
@@ -103,6 +104,7 @@ def rewind(cursor: Record, profile: Array, rate: Int) -> None:
     cursor.jerk = profile[0].jerk
     cursor.phase = 0
     cursor.rate = rate
+    cursor.slope = 0
 
 
 @step
@@ -140,8 +142,8 @@ def next_tick(params: Record, cursor: Record, profile: Array) -> None:
 
 @step
 def times(value: Int, factor: Int) -> Int:
-    """value * factor / 2^24, rounded half up, without a product beyond 63 bits: 0 <= factor <
-    2^25, |value| < 2^61."""
+    """value * factor / 2^24, rounded half up, without a product beyond 63 bits: |factor| < 2^25,
+    |value| < 2^61."""
     return (value >> Q_RATE) * factor + round_shift((value & (ONE - 1)) * factor, Q_RATE)
 
 
@@ -157,25 +159,56 @@ def position(cursor: Record) -> Int:
 
 
 @step
-def speed(params: Record, cursor: Record) -> Int:
-    """Reference speed, m/s, Q24."""
+def planned_units(cursor: Record) -> Int:
+    """Speed of the timetable at its planned pace, in units of the table."""
     v = int64(cursor.v)
-    if int64(cursor.rate) != 0:
+    if int64(cursor.phase) > 0:
         f = int64(cursor.phase)
         v += times(2 * int64(cursor.a) + times(int64(cursor.jerk), f), f)
+    return v
+
+
+@step
+def planned_speed(params: Record, cursor: Record) -> Int:
+    """p', speed of the timetable at its planned pace, m/s, Q24."""
+    return sat32(round_shift(planned_units(cursor) * int64(params.speed_factor), 16))
+
+
+@step
+def speed(params: Record, cursor: Record) -> Int:
+    """Reference speed, r p', m/s, Q24."""
+    v = planned_units(cursor)
+    if int64(cursor.rate) != 0:
         v = times(v, ONE + int64(cursor.rate))
     return sat32(round_shift(v * int64(params.speed_factor), 16))
 
 
 @step
-def acceleration(params: Record, cursor: Record) -> Int:
-    """Reference acceleration, m/s^2, Q27."""
+def planned_acceleration(params: Record, cursor: Record) -> Int:
+    """r^2 p'', acceleration of the reference at a pace that stays, m/s^2, Q27."""
     a = int64(cursor.a)
+    if int64(cursor.phase) > 0:
+        a += times(int64(cursor.jerk), int64(cursor.phase))
     if int64(cursor.rate) != 0:
         rate = ONE + int64(cursor.rate)
-        a += times(int64(cursor.jerk), int64(cursor.phase))
         a = times(times(a, rate), rate)
     return sat32(round_shift(a * int64(params.acceleration_factor), 13))
+
+
+@step
+def pacing_acceleration(params: Record, cursor: Record, slope: Int) -> Int:
+    """r' p', what a pace that changes by `slope` a tick (Q24) adds, m/s^2, Q27."""
+    a = times(planned_units(cursor), slope) >> 1  # a unit of the speed a tick is half of one
+    return sat32(round_shift(a * int64(params.acceleration_factor), 13))
+
+
+@step
+def acceleration(params: Record, cursor: Record) -> Int:
+    """Reference acceleration, m/s^2, Q27."""
+    a = planned_acceleration(params, cursor)
+    if int64(cursor.slope) != 0:
+        a = sat32(a + pacing_acceleration(params, cursor, int64(cursor.slope)))
+    return a
 
 
 def length(profile: np.ndarray) -> int:

@@ -23,6 +23,7 @@ SHARED_MODULES = (
     "ato_hil.controller.separation",
     "ato_hil.controller.neighbours",
     "ato_hil.controller.rebasing",
+    "ato_hil.controller.yielding",
     "ato_hil.controller.distribution",
     "ato_hil.controller.firmware",
 )

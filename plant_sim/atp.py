@@ -101,6 +101,8 @@ Part = Annotated[float, msgspec.Meta(ge=0, le=1)]
 UnderReading = Annotated[float, msgspec.Meta(ge=0, le=0.2)]
 BuildUpFactor = Annotated[float, msgspec.Meta(ge=1, le=5)]
 Ticks = Annotated[int, msgspec.Meta(ge=1, le=10_000)]
+TimeOfRun = Annotated[float, msgspec.Meta(ge=0, le=1e5)]
+Run = Annotated[int, msgspec.Meta(ge=1, le=4095)]
 
 
 class StaticSpeed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -108,6 +110,32 @@ class StaticSpeed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     until_m: Place  # position up to which it holds
     speed_m_s: PositiveSpeed  # the limit
+
+
+class TemporarySpeed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A speed from place to place, in some runs, from a time on or up to one."""
+
+    from_m: Place  # where it begins, for the front
+    to_m: Place  # where it ends, for the rear
+    speed_m_s: PositiveSpeed  # the limit
+    from_s: TimeOfRun = 0.0  # time of a run from which on it is supervised
+    to_s: TimeOfRun | None = None  # up to which; none: to its end
+    from_run: Run = 1  # the first run with it
+    to_run: Run | None = None  # the last one; none: all
+
+    def __post_init__(self) -> None:
+        if self.to_m <= self.from_m:
+            raise ValueError(f"to_m is {self.to_m:g}, expected more than from_m, {self.from_m:g}")
+        if self.to_s is not None and self.to_s <= self.from_s:
+            raise ValueError(f"to_s is {self.to_s:g}, expected more than from_s, {self.from_s:g}")
+        if self.to_run is not None and self.to_run < self.from_run:
+            raise ValueError(
+                f"to_run is {self.to_run}, expected from_run, {self.from_run}, or more"
+            )
+
+    def holds_in(self, run: int) -> bool:
+        """Whether run `run` has it."""
+        return self.from_run <= run and (self.to_run is None or run <= self.to_run)
 
 
 class Factor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -123,6 +151,7 @@ class Atp(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     supervision: str = "none"  # none | margin | etcs
     margin_m_s: SpeedMargin = 2 / 3.6  # of `margin`
     speeds: list[StaticSpeed] = []  # by position; none: the limits over time alone
+    temporary: list[TemporarySpeed] = []  # lower speeds besides, for a time
     train_length_m: Length = 0.0  # the rear too has to leave a lower speed; gradients under it
     # Position of the front at which it has to stand; none: no end.
     end_of_authority_m: Place | None = None
@@ -199,8 +228,20 @@ LIMIT = np.dtype(
 
 SPEED = np.dtype([("from_m", np.float64), ("speed_m_s", np.float64)])
 
+TEMPORARY = np.dtype(
+    [
+        ("from_tick", np.int64),  # from there to there it is supervised
+        ("until_tick", np.int64),
+        ("from_m", np.float64),  # of the front
+        ("to_m", np.float64),  # likewise
+        ("speed_m_s", np.float64),
+    ]
+)
+
 TARGET = np.dtype(
     [
+        ("from_tick", np.int64),  # from there to there it counts
+        ("until_tick", np.int64),
         ("begin_m", np.float64),  # from here to there its curves count
         ("end_m", np.float64),
         ("speed_m_s", np.float64),
@@ -228,6 +269,7 @@ class Limits(NamedTuple):
     speeds: Any  # [n] of SPEED, the first from -inf
     targets: Any  # [n] of TARGET
     knots: Any  # [n] of KNOT
+    temporary: Any  # [n] of TEMPORARY
 
 
 PARAMS = np.dtype(
@@ -313,7 +355,7 @@ def supervise(
     """The curves where the train is, and what ATP demands of it in this control period."""
     find_ceilings(params, limits, state, tick, position_m)
     if params.supervision == ETCS:
-        find_curves(limits, state, position_m)
+        find_curves(limits, state, tick, position_m)
     if params.supervision != NONE:
         decide(params, state, speed_m_s)
 
@@ -328,6 +370,12 @@ def find_ceilings(params: Any, limits: Any, state: Any, tick: Any, position_m: A
     place = section_at(limits.speeds, position_m, state.place)
     state.place = place
     permitted = min(limits.times[row].speed_m_s, limits.speeds[place].speed_m_s)
+    for number in range(len(limits.temporary)):
+        lower = limits.temporary[number]
+        if is_inside(lower.from_tick, lower.until_tick, tick) and (
+            lower.from_m <= position_m and position_m < lower.to_m
+        ):
+            permitted = min(permitted, lower.speed_m_s)
     curve = state.curve_m_s
     curve[PERMITTED] = permitted
     curve[WARN] = np.inf
@@ -344,10 +392,34 @@ def find_ceilings(params: Any, limits: Any, state: Any, tick: Any, position_m: A
         curve[EBI] = permitted + dv_ebi(permitted)
     state.target_speed_m_s = permitted
     state.target_distance_m = np.inf
+    if params.supervision == MARGIN:
+        announce(limits, state, tick, position_m)
 
 
 @step
-def find_curves(limits: Any, state: Any, position_m: Any) -> None:
+def is_inside(first: Any, last: Any, tick: Any) -> Any:
+    """1 if a tick lies between two, both of them included."""
+    return int64(1) if first <= tick and tick <= last else int64(0)
+
+
+@step
+def announce(limits: Any, state: Any, tick: Any, position_m: Any) -> None:
+    """The next temporary speed is the target: `margin` has no curves that lead to it."""
+    for number in range(len(limits.temporary)):
+        lower = limits.temporary[number]
+        ahead_m = lower.from_m - position_m
+        if (
+            is_inside(lower.from_tick, lower.until_tick, tick)
+            and ahead_m > 0.0
+            and ahead_m < state.target_distance_m
+            and lower.speed_m_s < state.curve_m_s[PERMITTED]
+        ):
+            state.target_speed_m_s = lower.speed_m_s
+            state.target_distance_m = ahead_m
+
+
+@step
+def find_curves(limits: Any, state: Any, tick: Any, position_m: Any) -> None:
     """Lowers the curves to those of the targets; the most restrictive target is the one whose
     permitted speed is least, or the next one while none limits."""
     curve = state.curve_m_s
@@ -356,6 +428,8 @@ def find_curves(limits: Any, state: Any, position_m: Any) -> None:
     for number in range(len(limits.targets)):
         target = limits.targets[number]
         if position_m >= target.end_m or target.speed_m_s >= ceiling:
+            continue
+        if not is_inside(target.from_tick, target.until_tick, tick):
             continue
         speed = curve_speed(limits.knots, target, INDICATION, position_m)
         curve[INDICATION] = min(curve[INDICATION], speed)

@@ -30,10 +30,12 @@ from ato_hil.plant_sim.atp import (
     SBI,
     SPEED,
     TARGET,
+    TEMPORARY,
     WARN,
     Atp,
     Factor,
     Limits,
+    TemporarySpeed,
     dv_ebi,
     dv_sbi,
     dv_warning,
@@ -47,6 +49,7 @@ LEAST_DECELERATION_M_S2 = 0.05  # on the steepest downhill
 # Rotating mass that counts where it is not known: of the mass, as the standard has it.
 ROTATING_UPHILL, ROTATING_DOWNHILL = 0.15, 0.02
 INDICATION_LEAST_S = 5.0
+NEVER = 2**62  # tick
 SAME_PLACE_M = 1e-6  # a place plus and minus a length may differ from it by rounding
 
 
@@ -302,6 +305,7 @@ class _Tables:
     def __init__(self) -> None:
         self.targets: list[tuple[Any, ...]] = []
         self.knots: list[tuple[float, float, float, float]] = []
+        self.ticks = (0, NEVER)  # from when to when what is added counts
 
     def add(
         self,
@@ -318,7 +322,7 @@ class _Tables:
             last[kind] = len(self.knots)
         floor = [floors.get(kind, 0.0) for kind in range(CURVES)]
         begin_m = curves[PERMITTED][0][0]
-        self.targets.append((begin_m, end_m, speed_m_s, reach_m, floor, first, last))
+        self.targets.append((*self.ticks, begin_m, end_m, speed_m_s, reach_m, floor, first, last))
 
 
 def supervised(
@@ -348,7 +352,26 @@ def supervised(
                 _add_lower_speed(made, atp, delays, gradient, place, after, top_m_s)
         if atp.end_of_authority_m is not None:
             _add_authority(made, atp, delays, gradient, atp.end_of_authority_m, top_m_s)
-    return Limits(times, speeds, np.array(made.targets, TARGET), np.array(made.knots, KNOT))
+        for lower in atp.temporary:
+            made.ticks = _ticks_of(lower, period_s)
+            _add_lower_speed(made, atp, delays, gradient, lower.from_m, lower.speed_m_s, top_m_s)
+    temporary = [
+        (*_ticks_of(row, period_s), row.from_m, row.to_m + atp.train_length_m, row.speed_m_s)
+        for row in atp.temporary
+    ]
+    return Limits(
+        times,
+        speeds,
+        np.array(made.targets, TARGET),
+        np.array(made.knots, KNOT),
+        np.array(temporary, TEMPORARY),
+    )
+
+
+def _ticks_of(lower: TemporarySpeed, period_s: float) -> tuple[int, int]:
+    """First and last tick of a run in which a temporary speed is supervised."""
+    last = NEVER if lower.to_s is None else round(lower.to_s / period_s)
+    return round(lower.from_s / period_s), last
 
 
 def _emergency_curves(

@@ -107,6 +107,7 @@ class ProfilePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     stops: tuple[Stop, ...] = ()  # with an objective, instead of duration_s and distance_m
     from_stop: int = 1  # the part of `stops` that is run; 1 is the first
     to_stop: int | None = None  # none: the last
+    overtime_s: NotNegative = 0.0  # the run of a service goes on so much longer, for a late train
     # With an objective: part of the train's forces that it uses, the rest is for control.
     force_share: Share = 0.9
     # With an objective: part of the braking work that counts as won back.
@@ -122,7 +123,7 @@ class ProfilePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
             raise PlanError("a plan needs ramps and duration_s, or an objective")
         if self.objective is not None and (self.ramps or self.limits):
             raise PlanError("a plan with an objective takes neither ramps nor limits over time")
-        if self.stops or self.from_stop != 1 or self.to_stop is not None:
+        if self.stops or self.from_stop != 1 or self.to_stop is not None or self.overtime_s:
             self._check_stops()
             return
         if self.objective is not None and self.distance_m is None:

@@ -165,6 +165,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     guard: dict[str, Any] = {}  # what the guard tolerates and how it brakes
     neighbours: dict[str, Any] = {}  # of a line
     rebasing: dict[str, Any] | None = None  # of a line; none: its trains keep their timetables
+    yielding: dict[str, Any] | None = None  # none: the timetable keeps its pace, whatever ATP says
 
 
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -578,8 +579,8 @@ def _own_numbers(loaded: Loaded, line: Line, train: int) -> Scenario:
 
 
 def in_run(loaded: Loaded, run: int) -> Loaded:
-    """A train's scenario with what has changed by run `run`. Raises ScenarioError if a change is
-    wrong."""
+    """A train's scenario with what has changed by run `run`, and the temporary speeds of that run.
+    Raises ScenarioError if a change is wrong."""
     scenario, place = loaded.scenario, _place(loaded.path, loaded.case)
     for number, change in enumerate(loaded.scenario.changes):
         if change.from_run > run:
@@ -601,6 +602,10 @@ def in_run(loaded: Loaded, run: int) -> Loaded:
             raise ScenarioError(f"{where}.train: expected {cars} cars, as the controller knows")
         _check(place, changed, f"changes[{number}].")
         scenario = changed
+    temporary = [lower for lower in scenario.atp.temporary if lower.holds_in(run)]
+    if temporary != scenario.atp.temporary:
+        supervision = msgspec.structs.replace(scenario.atp, temporary=temporary)
+        scenario = msgspec.structs.replace(scenario, atp=supervision)
     return (
         loaded
         if scenario is loaded.scenario
@@ -672,6 +677,16 @@ def _check(path: str, scenario: Scenario, under: str = "") -> None:
     has_limits = scenario.profile.limits or scenario.profile.limit_above_m_s is not None
     if not has_limits and not scenario.atp.speeds:
         raise ScenarioError(f"{path}: key {under}profile.limits: expected at least one limit")
+    if scenario.atp.temporary and scenario.atp.supervision == "none":
+        raise ScenarioError(
+            f"{path}: key {under}atp.temporary: supervision is none, expected margin or etcs"
+        )
+    if scenario.control.yielding is not None:
+        for key, value in (("line", scenario.line), ("run_length", scenario.run_length)):
+            if value is not None:
+                raise ScenarioError(
+                    f"{path}: key {under}control.yielding: with {key}, expected none"
+                )
     fault = braking_fault(scenario.atp, sections(known(scenario.track)))
     if fault:
         raise ScenarioError(f"{path}: key {under}{fault}")

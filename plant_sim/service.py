@@ -57,6 +57,8 @@ def plan_service(
         nonlocal tick, held
         arrival, late = tick, held
         extra = whole_ticks(stop.held_s, f"stops[{number - 1}].held_s", units)
+        if number == stops[-1][0]:
+            extra += whole_ticks(plan.overtime_s, "overtime_s", units)
         ticks = extra + whole_ticks(stop.dwell_s, f"stops[{number - 1}].dwell_s", units)
         if ticks:
             tables.append(np.array([(ticks, 0)], SEGMENT))
@@ -89,6 +91,7 @@ def section_of(plan: ProfilePlan, distance_m: float, duration_s: float | None) -
         stops=(),
         from_stop=1,
         to_stop=None,
+        overtime_s=0.0,
         distance_m=distance_m,
         duration_s=duration_s,
     )

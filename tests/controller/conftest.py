@@ -25,7 +25,7 @@ def interpreted() -> Iterator[Callable[..., Any]]:
     worker = subprocess.Popen(
         [sys.executable, str(Path(__file__).with_name("interpreter.py"))],
         cwd=ROOT,
-        env=os.environ | {"ATO_HIL_INTERPRETED": "1", "PYTHONPATH": str(ROOT)},
+        env=os.environ | {"ATO_HIL_INTERPRETED": "1", "PYTHONPATH": str(ROOT / "src")},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )

@@ -666,6 +666,52 @@ def test_what_is_wrong_is_said_in_one_line(tables, expected):
     assert "\n" not in text
 
 
+def lowered(supervision, **more):
+    lower = atp.TemporarySpeed(from_m=1000.0, to_m=1100.0, speed_m_s=10.0, **more)
+    known = atp.Atp(supervision=supervision, temporary=[lower], train_length_m=50.0)
+    return Supervisor(known, limits_for(known, limit=20.0))
+
+
+@pytest.mark.parametrize("supervision", ["margin", "etcs"])
+def test_a_temporary_speed_holds_for_front_and_rear_in_its_time(supervision):
+    supervised = lowered(supervision, from_s=2.0, to_s=4.0)
+    for tick, inside in ((199, 20.0), (200, 10.0), (400, 10.0), (401, 20.0)):
+        for place, permitted in ((999.9, 20.0), (1000.0, inside), (1149.9, inside), (1150.0, 20.0)):
+            supervised.at(place, 0.0, tick)
+            found = float(supervised.state[0]["curve_m_s"][atp.PERMITTED])
+            if supervision == "margin" or place >= 1000.0:
+                assert found == permitted
+            else:
+                assert 10.0 <= found <= (10.1 if inside == 10.0 else 20.0)
+
+
+def test_a_temporary_speed_is_announced():
+    supervised = lowered("margin", to_s=4.0)
+    for place, tick, target in (
+        (400.0, 0, (10.0, 600.0)),
+        (999.0, 400, (10.0, 1.0)),
+        (999.0, 401, (20.0, math.inf)),
+        (1000.0, 0, (10.0, math.inf)),
+        (1200.0, 0, (20.0, math.inf)),
+    ):
+        supervised.at(place, 0.0, tick)
+        state = supervised.state[0]
+        assert (state["target_speed_m_s"], state["target_distance_m"]) == target
+
+
+def test_a_temporary_speed_is_braked_to_as_a_static_one():
+    static = atp.Atp(
+        supervision="etcs",
+        speeds=[
+            atp.StaticSpeed(until_m=1000.0, speed_m_s=20.0),
+            atp.StaticSpeed(until_m=1e5, speed_m_s=10.0),
+        ],
+    )
+    one, other = Supervisor(static, limits_for(static, limit=20.0)), lowered("etcs")
+    for place in np.arange(0.0, 1100.0, 7.0):
+        assert (one.curves(place) == other.curves(place)).all()
+
+
 def test_static_speeds_do_without_limits_over_time():
     plan = {"limits": [], "limit_above_m_s": None}
     with pytest.raises(ScenarioError, match=r"key profile\.limits: expected at least one limit"):

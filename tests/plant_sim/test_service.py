@@ -186,6 +186,116 @@ def test_what_holds_a_train_makes_it_late_from_there_on(file, loaded):
     assert run.row["stops"][0]["doors_open_s"] == pytest.approx(10.5, abs=0.2)
 
 
+LOWER = """
+[[atp.temporary]]
+from_m = 260.0
+to_m = 380.0
+speed_m_s = 5.0
+"""
+
+
+def lowered(file, more="", lower=LOWER):
+    """The same scenario with a temporary speed, to which its timetable gives way."""
+    name = changed(file, "[control.guard]", "[control.yielding]\n\n[control.guard]")
+    path = file.parent / "changed.toml"
+    text = path.read_text().replace("max_speed_m_s = 15.0", "max_speed_m_s = 15.0\novertime_s = 25")
+    path.write_text(text + lower + more)
+    load.cache_clear()
+    return name
+
+
+def test_a_temporary_speed_makes_a_train_late_that_keeps_it(file, loaded):
+    name = lowered(file)
+    assert load(name).ticks == loaded.ticks + 2500
+    (run,) = ato_hil.simulate(name)
+    assert run.row["faults"] == ["timetable re-based"]
+    assert run.row["overspeed_margin_m_s"] > 0.05
+    assert run.row["atp_interventions"] == 0
+    truth = run.truths[0]
+    inside = (truth["position_m"] >= 260) & (truth["position_m"] < 380)
+    assert (truth["permitted_speed_m_s"][inside] == 5.0).all()
+    assert truth["speed_m_s"][inside].max() < 5.0
+    rows = run.row["stops"]
+    late = [each["arrival_late_s"] for each in rows]
+    assert late[0] == pytest.approx(0, abs=0.2)
+    assert late[1] > 14  # 120 m at 4.8 m/s for 11
+    assert late[2] == pytest.approx(late[1], abs=0.1)
+    for each, dwell_s in zip(rows[:2], (3, 4), strict=True):
+        assert each["stood_s"] == pytest.approx(dwell_s, abs=0.7)
+    assert all(abs(each["stop_error_m"]) < 0.1 for each in rows)
+    assert run.row["max_arrival_deviation_s"] == max(late)
+
+
+@pytest.mark.parametrize(
+    ("more", "late"),
+    [
+        ("from_run = 2", [False, True]),
+        ("to_run = 1", [True, False]),
+        ("from_s = 40.0\nto_s = 80.0", [True, True]),
+        ("to_s = 40.0", [False, False]),  # it is before it is reached
+        ("from_s = 75.0", [False, False]),  # it has been passed
+    ],
+)
+def test_a_temporary_speed_is_of_some_runs_and_times(file, more, late):
+    runs = ato_hil.simulate(lowered(file, more), runs=2)
+    assert [run.row["stops"][-1]["arrival_late_s"] > 5 for run in runs] == late
+
+
+def test_with_curves_it_brakes_before_them(file):
+    curves = """
+[atp.emergency_brake]
+steps = [{ deceleration_m_s2 = 1.2 }]
+build_up_s = 1.0
+"""
+    name = lowered(file, curves)
+    path = file.parent / "changed.toml"
+    path.write_text(path.read_text().replace('"margin"', '"etcs"'))
+    load.cache_clear()
+    (run,) = ato_hil.simulate(name)
+    assert run.row["faults"] == ["timetable re-based"]
+    assert run.row["overspeed_margin_m_s"] > 0.05
+    assert run.row["stops"][-1]["arrival_late_s"] > 14
+
+
+def test_a_late_run_over_the_bus_has_the_digest_of_sil(file, tmp_path):
+    name = lowered(file)
+    digests = {
+        ato_hil.simulate(name, mode=mode, **more).complete().digest
+        for mode, more in (("sil", {}), ("hil", {"bus": f"hub:{tmp_path.name[-20:]}"}))
+    }
+    assert len(digests) == 1
+
+
+def test_a_run_that_is_late_is_not_learned_from(file):
+    name = lowered(file, "from_run = 2\nto_run = 2")
+    path = file.parent / "changed.toml"
+    gains = load("yizhuang").scenario.laws["cailc"]
+    rows = "\n".join(f"{key} = {value}" for key, value in gains.items())
+    memory = "[control.memory]\ndecimation = 16\nlead_ticks = 25\n"
+    path.write_text(f"{path.read_text()}\n{memory}\n[laws.cailc]\n{rows}\n")
+    load.cache_clear()
+    first, second, third = ato_hil.simulate(name, law="cailc", runs=3)
+    assert [run.row["faults"] for run in (first, third)] == [[], []]
+    assert second.row["faults"] == ["timetable re-based"]
+    assert third.row["rms_position_error_m"] < first.row["rms_position_error_m"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("to_m = 380.0", "to_m = 260.0", r"atp.temporary\[0\].* to_m is 260, expected more than"),
+        ("speed_m_s = 5.0", "", r"atp.temporary\[0\]: .*missing required field `speed_m_s`"),
+        ("speed_m_s = 5.0", "speed_m_s = 5.0\nto_s = 0.0", "to_s is 0, expected more than from_s"),
+        ("speed_m_s = 5.0", "speed_m_s = 5.0\nfrom_run = 3\nto_run = 2", "to_run is 2, expected"),
+        ("[[atp", "[run_length]\nshortest_s = 50\nlongest_s = 60\n[[atp", "run_length: a service"),
+    ],
+)
+def test_bad_temporary_speeds_are_one_line(file, old, new, message):
+    with pytest.raises(ScenarioError, match=message) as refused:
+        load(lowered(file, lower=LOWER.replace(old, new)))
+    assert "\n" not in str(refused.value)
+
+
 def test_a_part_runs_where_it_lies(file, loaded):
     name = with_part(str(file), "C", None)
     assert name == f"{file}@3-4"
@@ -218,6 +328,20 @@ def test_a_train_that_does_not_come_to_rest_has_no_arrival(loaded):
     assert first["stop_error_m"] is None
     assert first["stood_s"] == first["doors_open_s"] == 0.0
     assert len(stop_rows(loaded, truth[: departure + 1])) == 1
+
+
+def test_a_train_that_stays_at_a_stop_has_no_arrival_at_the_next_ones(loaded):
+    truth = np.zeros(loaded.ticks, plant.TRUTH)
+    there = loaded.calls[1].arrival
+    for name, column in (
+        ("position_m", loaded.profile.position_m),
+        ("speed_m_s", loaded.profile.speed_m_s),
+    ):
+        truth[name] = column[np.minimum(np.arange(loaded.ticks), there)]
+    first, *others = stop_rows(loaded, truth)
+    assert abs(first["arrival_late_s"]) < 0.2
+    assert [each["arrival_late_s"] for each in others] == [None, None]
+    assert [each["stood_s"] for each in others] == [0, 0]
 
 
 def test_a_folder_gives_the_service_back(file, tmp_path, loaded):

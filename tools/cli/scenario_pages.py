@@ -22,6 +22,7 @@ from ato_hil.controller.memory import MemorySettings
 from ato_hil.controller.neighbours import NeighbourSettings
 from ato_hil.controller.rebasing import RebasingSettings
 from ato_hil.controller.registry import law_names, load_law
+from ato_hil.controller.yielding import YieldingSettings
 from ato_hil.plant_sim.scenario import (
     Scenario,
     ScenarioError,
@@ -35,6 +36,7 @@ SETTINGS = {
     "control.guard": GuardSettings,
     "control.neighbours": NeighbourSettings,
     "control.rebasing": RebasingSettings,
+    "control.yielding": YieldingSettings,
 }
 UNITS = {
     "m_s3": "m/s³",

@@ -56,7 +56,9 @@ LIMITS = Fields(
     "ato_limits",
     tuple(
         (name, Rows(getattr(atp, kind), 1))
-        for name, kind in zip(atp.Limits._fields, ("LIMIT", "SPEED", "TARGET", "KNOT"), strict=True)
+        for name, kind in zip(
+            atp.Limits._fields, ("LIMIT", "SPEED", "TARGET", "KNOT", "TEMPORARY"), strict=True
+        )
     ),
 )
 REAL = """static double min_real(double a, double b) { return b < a ? b : a; }

@@ -24,6 +24,7 @@ from ato_hil.controller.registry import (
     law_names,
     load_law,
 )
+from ato_hil.controller.yielding import YieldingSettings
 from ato_hil.plant_sim import track
 from ato_hil.plant_sim.scenario import Loaded, Scenario, ScenarioError
 from ato_hil.plant_sim.trains import point
@@ -61,6 +62,9 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
             map_sections=_map_sections(loaded),
             start_m=loaded.start_m,
             line=_line(loaded),
+            yielding_settings=None
+            if scenario.control.yielding is None
+            else _settings("control.yielding", scenario.control.yielding, YieldingSettings),
             scenario_digest=loaded.digest,
         )
     except CalibrationError as error:

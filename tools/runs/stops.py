@@ -1,10 +1,11 @@
 """What the summary says of each stop of a service: when the train came, where it stood, and what
 the way there was like.
 
-A stop's row is of the ticks from the departure before it to its own, by the reference. The train
-arrives when it comes to rest and stays so until then: what is late against the timetable has
-`arrival_late_s` above 0, and a train that does not come to rest has none. Doors are counted by
-time: they are open from then until the departure if the train stands within DOORS_WITHIN_M.
+A stop's row is of the ticks from the departure before it to its own: by the reference, or, of a
+train that comes later than that, the train's. It arrives when it comes to rest there and stays so
+until then: what is late against the timetable has `arrival_late_s` above 0, and a train that does
+not come to rest there has none. Doors are counted by time: they are open from then until the
+departure if the train stands within DOORS_WITHIN_M.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ from typing import Any
 import numpy as np
 
 from ato_hil.plant_sim.scenario import Loaded
+from ato_hil.plant_sim.service import Call
 
 AT_REST_M_S = 1e-3
 DOORS_WITHIN_M = 0.5  # of the stop; platform doors leave about that
+STOP_WITHIN_M = 50.0  # of it a standstill is the stop, further off another one
 JERK_OVER_S = 0.5  # that a passenger feels: shorter jolts are the couplers' and springs'
 JOULES_A_KWH = 3.6e6
 
@@ -30,19 +33,21 @@ def stop_rows(loaded: Loaded, truth: np.ndarray) -> list[dict[str, Any]]:
     """
     period_s = loaded.scenario.period_s
     rows = []
-    for before, call in zip(loaded.calls, loaded.calls[1:], strict=False):
+    begin = loaded.calls[0].departure
+    for call in loaded.calls[1:]:
         if call.departure >= len(truth):
             break
-        ticks = slice(before.departure, call.departure + 1)
+        end = _departure(truth, call, begin)
+        ticks = slice(begin, end + 1)
         part, speed = truth[ticks], truth["speed_m_s"][ticks]
         moving = np.flatnonzero(speed > AT_REST_M_S)
         rest = int(moving[-1]) + 1 if len(moving) else 0
-        arrived = rest < len(part)
-        stood_s = (len(part) - 1 - rest) * period_s if arrived else 0.0
-        late_s = (before.departure + rest - call.due) * period_s
         error_m = float(part["position_m"][-1]) - call.position_m
+        arrived = 0 < rest < len(part) and abs(error_m) <= STOP_WITHIN_M
+        stood_s = (len(part) - 1 - rest) * period_s if arrived else 0.0
+        late_s = (begin + rest - call.due) * period_s
         margin = float(np.min(part["permitted_speed_m_s"] - speed))
-        span = min(max(round(JERK_OVER_S / period_s), 1), len(part) - 1)
+        span = max(min(round(JERK_OVER_S / period_s), len(part) - 1), 1)
         felt = part["acceleration_m_s2"]
         jerk = (felt[span:] - felt[:-span]) / (span * period_s)
         rows.append(
@@ -64,7 +69,22 @@ def stop_rows(loaded: Loaded, truth: np.ndarray) -> list[dict[str, Any]]:
                 "max_jerk_m_s3": _peak(jerk[speed[:-span] > AT_REST_M_S]),
             }
         )
+        begin = end
     return rows
+
+
+def _departure(truth: np.ndarray, call: Call, begin: int) -> int:
+    """The tick at which a train that left the stop before in tick `begin` leaves this one."""
+    at_rest = truth["speed_m_s"] <= AT_REST_M_S
+    near = np.abs(truth["position_m"] - call.position_m) <= STOP_WITHIN_M
+    if at_rest[call.departure] and near[call.departure]:
+        return call.departure
+    first = max(begin, call.departure)
+    there = first + np.flatnonzero(at_rest[first:] & near[first:])
+    if not len(there):
+        return first
+    moves = np.flatnonzero(~at_rest[there[0] :])
+    return int(there[0] + moves[0] - 1 if len(moves) else len(truth) - 1)
 
 
 def worst(rows: list[dict[str, Any]]) -> dict[str, Any]:

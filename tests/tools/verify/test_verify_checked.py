@@ -119,13 +119,22 @@ EXPECTED = {
 }
 
 
+def environment_with(folder):
+    cache = str(folder / "cache")
+    return {**os.environ, "NUMBA_CACHE_DIR": cache, "PYTHONPATH": str(ROOT / "src")}
+
+
 @pytest.fixture(scope="module")
 def outcome(tmp_path_factory):
     folder = tmp_path_factory.mktemp("checked")
     (folder / "steps.py").write_text(STEPS)
     process = subprocess.run(
         [sys.executable, str(folder / "steps.py")],
-        env={**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONPATH": str(ROOT)},
+        env={
+            **os.environ,
+            "NUMBA_CACHE_DIR": str(folder / "cache"),
+            "PYTHONPATH": str(ROOT / "src"),
+        },
         capture_output=True,
         text=True,
         check=True,
@@ -165,7 +174,11 @@ print(checked.whole_runs("pid", ["subway"]).error)
     (tmp_path / "beyond.py").write_text(code)
     process = subprocess.run(
         [sys.executable, str(tmp_path / "beyond.py")],
-        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)},
+        env={
+            **os.environ,
+            "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+            "PYTHONPATH": str(ROOT / "src"),
+        },
         capture_output=True,
         text=True,
         check=True,
