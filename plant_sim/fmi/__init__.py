@@ -6,6 +6,7 @@ What an FMU is asked for, and the bytes that go to and fro, stand here: both sid
 from __future__ import annotations
 
 import struct
+from typing import Literal
 
 import msgspec
 
@@ -24,6 +25,7 @@ class Port(msgspec.Struct, frozen=True):
     name: str
     key: str = ""  # of the scenario, for errors
     unit: str = ""  # that it has to have if it states one
+    kind: Literal["real", "whole", "number"] = "number"  # the last: one of the others
     needed: bool = True
 
 

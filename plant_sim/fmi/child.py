@@ -13,6 +13,7 @@ import socket
 import sys
 import zipfile
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from ato_hil.plant_sim.fmi import (
     OPEN,
     RESET,
     STEP,
+    TURN,
     VERIFY,
     Opened,
     Port,
@@ -34,11 +36,14 @@ from ato_hil.plant_sim.fmi import (
 
 TRANSCEIVER = "org.fmi-ls-bus.transceiver"
 ITERATIONS_MAX = 50  # of one event
+TEXT_MOST = 400  # characters of an error: names and texts in it are of others
+TROUBLE = (2, 3, 4)  # fmi2Status, fmi3Status: discard, error, fatal
 REALS = ("Real", "Float64", "Float32")
 WHOLES = (
     *("Integer", "Boolean", "Enumeration"),
     *(f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)),
 )
+KINDS = {"real": REALS, "whole": WHOLES, "number": (*REALS, *WHOLES)}
 # A unit of an FMU by its exponents of the SI's base units, and other names that tools give it.
 UNITS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {
     "m": ({"m": 1}, ("metre", "meter")),
@@ -123,7 +128,8 @@ class Fmu:
         self.description = described(wanted.file)
         self.fmi = "2.0" if self.description.fmiVersion == "2.0" else "3.0"
         self.variables = {v.name: v for v in self.description.modelVariables}
-        refuse_other_platforms(wanted.file, self.fmi, self.description)
+        self.said = ""  # the last trouble that it told of in the request under way
+        refuse_without_binary(wanted.file, self.fmi, self.description)
         may_have_bus = wanted.bus_outputs is not None and self.fmi == "3.0"
         self.bus = bus_of(wanted.file, self.variables) if may_have_bus else {}
         inputs, outputs = wanted.inputs, wanted.outputs
@@ -131,15 +137,15 @@ class Fmu:
             inputs, outputs = [], wanted.bus_outputs or []
         self.inputs = Ports(self._ports(inputs, "input"), self.fmi)
         self.outputs = Ports(self._ports(outputs, "output"), self.fmi)
-        for name in wanted.start:
-            if name not in self.variables:
-                raise FmuError(f"there is no parameter {name}")
+        for name, value in wanted.start.items():
+            self._check_parameter(name, value)
         from fmpy import extract
 
         try:
             self.folder = extract(wanted.file, unzipdir=str(folder))
-        except (OSError, zipfile.BadZipFile, ValueError) as error:
-            raise FmuError(f"cannot be unpacked: {error}") from None
+        except Exception as error:  # of a foreign archive, or of the disk
+            why = error.strerror if isinstance(error, OSError) else error
+            raise FmuError(f"cannot be unpacked: {why}") from None
         self.slave: Any = None
         self.time_s = 0.0
         self.steps = 0
@@ -163,6 +169,10 @@ class Fmu:
                 continue
             if variable.type not in (*REALS, *WHOLES) or variable.dimensions:
                 raise FmuError(f"{at}{port.name} is no number")
+            if variable.type not in KINDS[port.kind]:
+                raise FmuError(
+                    f"{at}{port.name} is of type {variable.type}, expected a {port.kind} number"
+                )
             allowed = ("output", "local") if causality == "output" else (causality,)
             if variable.causality not in allowed:
                 raise FmuError(
@@ -191,6 +201,19 @@ class Fmu:
                 return
         raise FmuError(f"{at}{port.name} is in {unit}, expected {port.unit}")
 
+    def _check_parameter(self, name: str, value: float) -> None:
+        variable = self.variables.get(name)
+        if variable is None:
+            raise FmuError(f"there is no parameter {name}")
+        if variable.causality not in ("parameter", "input"):
+            raise FmuError(f"{name} is of causality {variable.causality}, expected parameter")
+        if variable.type not in (*REALS, *WHOLES) or variable.dimensions:
+            raise FmuError(f"parameter {name} is no number")
+        if variable.type == "Boolean" and value not in (0, 1):
+            raise FmuError(f"parameter {name} is {value:g}, expected 0 or 1")
+        if variable.type in WHOLES and value != int(value):
+            raise FmuError(f"parameter {name} is {value:g}, expected a whole number")
+
     def start(self) -> None:
         """A new instance at the start."""
         from fmpy.fmi2 import FMU2Slave
@@ -208,23 +231,43 @@ class Fmu:
         slave = FMU2Slave(**arguments) if self.fmi == "2.0" else FMU3Slave(**arguments)
         self.slave = slave
         if self.fmi == "2.0":
-            slave.instantiate()
+            slave.instantiate(callbacks=self._callbacks())
             slave.setupExperiment(startTime=0.0)
             self._set_start()
             slave.enterInitializationMode()
             slave.exitInitializationMode()
         else:
-            slave.instantiate(eventModeUsed=bool(self.bus))
+            slave.instantiate(eventModeUsed=bool(self.bus), logMessage=self._hear)
             self._set_start()
             slave.enterInitializationMode()
             slave.exitInitializationMode()
         self.time_s, self.steps = 0.0, 0
 
+    def _callbacks(self) -> Any:
+        """Of FMI 2.0, with `_hear` as the logger."""
+        import ctypes
+
+        from fmpy import calloc, fmi2, free
+
+        made = fmi2.fmi2CallbackFunctions()
+        made.logger = fmi2.fmi2CallbackLoggerTYPE(self._hear)
+        made.allocateMemory = fmi2.fmi2CallbackAllocateMemoryTYPE(calloc)
+        made.freeMemory = fmi2.fmi2CallbackFreeMemoryTYPE(free)
+        with suppress(ImportError, OSError):  # FMPy has it for some machines alone
+            from fmpy.logging import addLoggerProxy  # puts numbers into the text
+
+            addLoggerProxy(ctypes.byref(made))
+        return made
+
+    def _hear(self, *message: Any) -> None:
+        """A message of the FMU: in the end its status, category and text."""
+        status, _category, text = message[-3:]
+        if status in TROUBLE and text:
+            self.said = text.decode(errors="replace")
+
     def _set_start(self) -> None:
         for name, value in self.wanted.start.items():
             variable = self.variables[name]
-            if variable.type not in (*REALS, *WHOLES):
-                raise FmuError(f"parameter {name} is no number")
             group = Group(variable.type, [variable.valueReference], self.fmi)
             group.set(self.slave, [value if variable.type in REALS else int(value)])
 
@@ -315,31 +358,56 @@ def described(file: str) -> Any:
         from fmpy import read_model_description
     except ImportError:
         raise FmuError("FMPy is not installed, try: pip install 'ato-hil[fmi]'") from None
-    try:
-        description = read_model_description(file, validate=False)
-    except FileNotFoundError:
-        raise FmuError("no such file") from None
-    except Exception as error:  # of a foreign file, whatever it is
-        text = " ".join(str(error).split()) or type(error).__name__
-        raise FmuError(f"no FMU: {text}") from None
-    version = description.fmiVersion
+    version = version_of(file)
     if version != "2.0" and not version.startswith("3.0"):
         raise FmuError(f"is of FMI {version}, expected 2.0 or 3.0")
+    try:
+        description = read_model_description(file, validate=False)
+    except Exception as error:  # of a foreign file, whatever it is
+        raise FmuError(f"no FMU: {error or type(error).__name__}") from None
     if description.coSimulation is None:
         raise FmuError("is not for Co-Simulation")
+    if not description.coSimulation.modelIdentifier:
+        raise FmuError("no FMU: CoSimulation has no modelIdentifier")
     return description
 
 
-def refuse_other_platforms(file: str, fmi: str, description: Any) -> None:
+def version_of(file: str) -> str:
+    """That of FMI. Raises FmuError."""
+    from xml.etree import ElementTree
+
+    try:
+        with zipfile.ZipFile(file) as archive:
+            root = ElementTree.fromstring(archive.read("modelDescription.xml"))
+    except KeyError:
+        raise FmuError("no FMU: there is no modelDescription.xml in it") from None
+    except ElementTree.ParseError as error:
+        raise FmuError(f"no FMU: modelDescription.xml: {error}") from None
+    except Exception as error:  # of a foreign archive: damaged, encrypted, packed in other ways
+        raise FmuError(f"no FMU: {error or type(error).__name__}") from None
+    if root.tag != "fmiModelDescription":
+        raise FmuError(f"no FMU: modelDescription.xml has {root.tag}, expected fmiModelDescription")
+    return root.get("fmiVersion", "without a version")
+
+
+def refuse_without_binary(file: str, fmi: str, description: Any) -> None:
     """Raises FmuError if there is no binary for this machine."""
     import fmpy
 
     platform = fmpy.platform if fmi == "2.0" else fmpy.platform_tuple
     with zipfile.ZipFile(file) as archive:
-        binaries = [n.split("/") for n in archive.namelist() if n.startswith("binaries/")]
-    has = sorted({parts[1] for parts in binaries if len(parts) > 2 and parts[-1]})
-    if platform not in has:
-        raise FmuError(f"has binaries for {', '.join(has) or 'no machine'}, expected {platform}")
+        names = archive.namelist()
+    has = {name.split("/")[1] for name in names if name.startswith("binaries/")} - {""}
+    library = f"{description.coSimulation.modelIdentifier}{fmpy.sharedLibraryExtension}"
+    if f"binaries/{platform}/{library}" in names:
+        return
+    if platform in has:
+        raise FmuError(f"binaries/{platform} has no {library}")
+    if not has and any(name.startswith("sources/") for name in names):
+        raise FmuError(f"has no binary but sources, try: fmpy compile {file}")
+    raise FmuError(
+        f"has binaries for {', '.join(sorted(has)) or 'no machine'}, expected {platform}"
+    )
 
 
 def bus_of(file: str, variables: dict[str, Any]) -> dict[str, int]:
@@ -372,6 +440,12 @@ def bus_of(file: str, variables: dict[str, Any]) -> dict[str, int]:
     return {name: members[name].valueReference for name in names}
 
 
+def one_line(text: str) -> str:
+    """A text as one line, and not longer than TEXT_MOST."""
+    text = " ".join(text.split())
+    return text if len(text) <= TEXT_MOST else f"{text[:TEXT_MOST]} …"
+
+
 def serve(line: socket.socket, folder: Path) -> None:
     """Answers requests until the other side is gone."""
     fmu: Fmu | None = None
@@ -381,6 +455,8 @@ def serve(line: socket.socket, folder: Path) -> None:
             return
         kind, length = HEAD.unpack(head)
         content = line.recv(length, socket.MSG_WAITALL) if length else b""
+        if fmu is not None:
+            fmu.said = ""
         try:
             if kind == OPEN:
                 fmu = Fmu(msgspec.json.decode(content, type=Wanted), folder)
@@ -389,11 +465,13 @@ def serve(line: socket.socket, folder: Path) -> None:
             else:
                 assert fmu is not None
                 given = fmu.answer(kind, content)
-        except FmuError as error:
-            kind, given = ERROR, str(error).encode()
-        except Exception as error:  # of FMPy, or of the FMU through it
-            text = " ".join(str(error).split()).rstrip(".")
-            kind, given = ERROR, (text or type(error).__name__).encode()
+        except Exception as error:  # ours, of FMPy, or of the FMU through it
+            text = str(error).rstrip(".") or type(error).__name__
+            if fmu is not None and kind in (STEP, EVENT, TURN):
+                text += f" at {fmu.time_s:.6g} s"
+            if fmu is not None and fmu.said:
+                text += f"; it says: {fmu.said}"
+            kind, given = ERROR, one_line(text.replace(f"{folder}{os.sep}", "")).encode()
         line.sendall(HEAD.pack(kind, len(given)) + given)
 
 

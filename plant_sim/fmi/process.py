@@ -5,13 +5,14 @@ Whatever becomes of that process, or comes from it, is one line that names the f
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import struct
 import subprocess
 import tempfile
 from collections.abc import Iterable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import msgspec
@@ -90,6 +91,8 @@ class Fmu:
             try:
                 part = self._line.recv(count - len(got), socket.MSG_WAITALL)
             except BlockingIOError:
+                if self._process.poll() is not None:  # a child of its own holds the line open
+                    raise FmuError(self._end()) from None
                 raise FmuError(f"{self.file}: it hangs: no answer to a call") from None
             except ConnectionError:
                 part = b""
@@ -139,7 +142,10 @@ class Fmu:
 def start(wanted: Wanted, stack: ExitStack) -> Fmu:
     """The FMU, opened; closing `stack` ends its process. Raises FmuError."""
     if not Path(wanted.file).is_file():
-        raise FmuError(f"{wanted.file}: no such file")
+        is_folder = Path(wanted.file).is_dir()
+        raise FmuError(
+            f"{wanted.file}: {'a folder, expected an FMU' if is_folder else 'no such file'}"
+        )
     folder = stack.enter_context(
         tempfile.TemporaryDirectory(prefix="ato-hil-", ignore_cleanup_errors=True)
     )
@@ -162,5 +168,6 @@ def start(wanted: Wanted, stack: ExitStack) -> Fmu:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    process.kill()  # it has nothing to save
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)  # with what it has started; there is nothing to save
     process.wait()

@@ -21,6 +21,7 @@ from ato_hil.plant_sim.fmi import Port, Wanted, process
 from ato_hil.plant_sim.trains.lumped import CARS_MAX
 
 STEPS_MAX = 100  # of an FMU in a control period
+OUTPUT_MOST = 1e7  # m, m/s, m/s^2: more is no train
 
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
 
@@ -165,14 +166,14 @@ class Host:
     def __init__(self, train: Train, folder: Path, period_s: float) -> None:
         names = train.force if isinstance(train.force, list) else [train.force]
         outputs = [
-            Port(train.position, "train.position", "m"),
-            Port(train.speed, "train.speed", "m/s"),
+            Port(train.position, "train.position", "m", "real"),
+            Port(train.speed, "train.speed", "m/s", "real"),
         ]
         if train.acceleration:
-            outputs.append(Port(train.acceleration, "train.acceleration", "m/s2"))
+            outputs.append(Port(train.acceleration, "train.acceleration", "m/s2", "real"))
         wanted = Wanted(
             str(folder / train.file),
-            [Port(name, "train.force", "N") for name in names],
+            [Port(name, "train.force", "N", "real") for name in names],
             outputs,
             period_s / train.substeps,
             start=train.parameters,
@@ -183,6 +184,7 @@ class Host:
         self._fmu = process.start(wanted, stack)
         place = {name: k for k, name in enumerate(names)}
         self._inputs = [place[name] for name in self._fmu.inputs]
+        self._ports = outputs
         self._outputs = [self._fmu.outputs.index(port.name) for port in outputs]
         self._substeps = train.substeps
 
@@ -198,12 +200,15 @@ class Host:
         self._take(state, self._fmu.step([[row[k] for k in inputs] for row in rows]))
 
     def _take(self, state: Any, outputs: tuple[float, ...]) -> None:
-        names = ("next_position_m", "next_speed_m_s", "next_acceleration_m_s2")
-        values = [outputs[k] for k in self._outputs]
-        if not np.isfinite(values).all():
-            raise process.FmuError(f"{self._fmu.file}: it gives a number that is none")
-        for name, value in zip(names, values, strict=False):
-            state[name] = value
+        fields = ("next_position_m", "next_speed_m_s", "next_acceleration_m_s2")
+        for field, port, k in zip(fields, self._ports, self._outputs, strict=False):
+            value = outputs[k]
+            if not abs(value) <= OUTPUT_MOST:
+                raise process.FmuError(
+                    f"{self._fmu.file}: key {port.key}: {port.name} is {value:g} {port.unit},"
+                    f" expected a number of at most {OUTPUT_MOST:g}"
+                )
+            state[field] = value
 
     def repeats(self) -> bool:
         """Whether all of this run comes out the same from another instance."""

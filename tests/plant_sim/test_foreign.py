@@ -1,7 +1,10 @@
 """A train that is an FMU, in the place of the built-in one."""
 
+import fcntl
 import itertools
 import shutil
+import time
+import zipfile
 
 import pytest
 
@@ -46,6 +49,18 @@ def changed(place, name, old, new, file="fmu_model.c"):
     assert old in made.sources[file]
     sources = made.sources | {file: made.sources[file].replace(old, new, 1)}
     archive.write(archive.Unpacked(made.about, made.interface, sources), place / name)
+
+
+def rewritten(place, name, change):
+    """The same train with other members: `change` takes name and content of each, and gives those
+    that there are instead."""
+    with (
+        zipfile.ZipFile(place / "bare.fmu") as old,
+        zipfile.ZipFile(place / name, "w") as new,
+    ):
+        for member in old.namelist():
+            for path, content in change(member, old.read(member)):
+                new.writestr(path, content)
 
 
 @pytest.fixture
@@ -120,7 +135,14 @@ def test_a_wrong_unit_is_one_line(run):
     [
         ("*(volatile int *)0 = 0;", r"it crashed \(SIGSEGV\)"),
         ("for (volatile int k = 0; k >= 0;) { k = 0; }", "it hangs: no answer to a call"),
-        ("own->state.speed_m_s = 0.0 / (own->state.position_m * 0.0);", "a number that is none"),
+        (
+            "own->state.speed_m_s = 0.0 / (own->state.position_m * 0.0);",
+            r"key train\.speed: speed is -?nan m/s, expected a number of at most 1e\+07",
+        ),
+        (
+            "own->state.speed_m_s = 1e200;",
+            r"speed is 1e\+200 m/s, expected a number of at most 1e\+07",
+        ),
     ],
 )
 def test_what_it_does_to_its_process_is_one_line(place, run, monkeypatch, new, said):
@@ -129,6 +151,100 @@ def test_what_it_does_to_its_process_is_one_line(place, run, monkeypatch, new, s
     changed(place, "bad.fmu", old, "    " + new + "\n" + old)
     with pytest.raises(RunError, match=rf"bad\.fmu: .*{said}$"):
         run("bad.fmu")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("<fmiModelDescription", "<other", r"no FMU: modelDescription\.xml: "),
+        (' fmiVersion="3.0"', "", "is of FMI without a version, expected 2.0 or 3.0"),
+        ('fmiVersion="3.0"', 'fmiVersion="1.0"', r"is of FMI 1\.0, expected 2\.0 or 3\.0"),
+        (' modelIdentifier="bare_train"', "", "no FMU: CoSimulation has no modelIdentifier"),
+        ('modelIdentifier="bare_train"', 'modelIdentifier="../a"', r"\S+ has no \.\./a\.\w+"),
+        (
+            '<Float64 name="position"',
+            '<Boolean name="position"',
+            r"key train\.position: position is of type Boolean, expected a real number",
+        ),
+        (
+            '<Float64 name="force"',
+            '<Int32 name="force"',
+            r"key train\.force: force is of type Int32, expected a real number",
+        ),
+    ],
+)
+def test_a_description_that_does_not_fit_is_one_line(place, run, old, new, said):
+    def change(member, content):
+        if member == "modelDescription.xml":
+            assert old.encode() in content
+            content = content.replace(old.encode(), new.encode())
+        return [(member, content)]
+
+    rewritten(place, "odd.fmu", change)
+    with pytest.raises(FmuError, match=rf"odd\.fmu: {said}"):
+        run("odd.fmu")
+
+
+def test_an_archive_that_is_none_is_one_line(place, run):
+    def without(start):
+        return lambda member, content: [] if member.startswith(start) else [(member, content)]
+
+    def beside(path):
+        return lambda member, content: [(member, content), (f"{path}/{member}", content)]
+
+    (place / "folder.fmu").mkdir(exist_ok=True)
+    (place / "empty.fmu").write_bytes(b"")
+    rewritten(place, "undescribed.fmu", without("modelDescription.xml"))
+    rewritten(place, "sources.fmu", without("binaries/"))
+    rewritten(place, "outside.fmu", beside("/tmp"))
+    rewritten(place, "long.fmu", beside("a" * 300))
+    for name, said in (
+        ("folder", "a folder, expected an FMU"),
+        ("empty", "no FMU: File is not a zip file"),
+        ("undescribed", "no FMU: there is no modelDescription.xml in it"),
+        ("sources", "has no binary but sources, try: fmpy compile .*sources.fmu"),
+        ("outside", "cannot be unpacked: .*|no FMU: Illegal path .*"),
+        ("long", "cannot be unpacked: File name too long"),
+    ):
+        with pytest.raises(FmuError, match=rf"{name}\.fmu: ({said})$"):
+            run(f"{name}.fmu")
+
+
+def test_a_parameter_that_is_none_is_one_line(run):
+    with pytest.raises(FmuError, match=r"speed is of causality output, expected parameter$"):
+        run(parameters={"speed": 1.0})
+
+
+def test_what_it_says_of_an_error_is_in_the_line(place, run):
+    old = '!= FMU_STEP) {\n        return refused(instance, "fmi3DoStep", "not in Step Mode");'
+    new = '== FMU_STEP) {\n        return refused(instance, "fmi3DoStep", "no coal\\n" "is left");'
+    changed(place, "coal.fmu", old, new, "fmu.c")
+    with pytest.raises(RunError) as caught:
+        run("coal.fmu")
+    line = str(caught.value)
+    assert line.endswith(" at 0 s; it says: fmi3DoStep: no coal is left")
+
+
+def test_what_it_has_started_ends_with_it(place, run, tmp_path):
+    lock = tmp_path / "lock"
+    changed(
+        place,
+        "fork.fmu",
+        "void fmu_model_reset(fmu_state *state) {",
+        "#include <fcntl.h>\n#include <sys/file.h>\n#include <unistd.h>\n"
+        "void fmu_model_reset(fmu_state *state) {\n"
+        f'    if (flock(open("{lock}", O_CREAT | O_RDWR, 0600), LOCK_EX | LOCK_NB) == 0\n'
+        "        && fork() == 0) { sleep(600); _exit(0); }\n",
+    )
+    run("fork.fmu")
+    with lock.open() as file:  # held for as long as one of them lives
+        for _ in range(100):
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            except BlockingIOError:
+                time.sleep(0.1)
+    pytest.fail("a process of the FMU outlives the run")
 
 
 def test_a_train_that_moves_otherwise_the_second_time_is_marked(place, run):

@@ -48,8 +48,12 @@ def working(text: str) -> Iterator[Callable[[str], None]]:
 
 
 def fail(message: str, code: int) -> typer.Exit:
-    """Says why on one line; what it returns, raised, ends the command with that exit status."""
-    errors.print(Text(f"ato-hil: {message}", "red"), soft_wrap=True)
+    """Says why on one line; what it returns, raised, ends the command with that exit status.
+
+    Names in a message are of others: a line feed or an escape in one is shown, not obeyed.
+    """
+    shown = "".join(c if c.isprintable() else repr(c)[1:-1] for c in message)
+    errors.print(Text(f"ato-hil: {shown}", "red"), soft_wrap=True)
     return typer.Exit(code)
 
 

@@ -240,16 +240,19 @@ def _opened(
     start: dict[str, float],
     stack: ExitStack,
 ) -> Fmu:
-    inputs = [f"{name}.fresh" for name in received]
+    inputs = [Port(f"{name}.fresh") for name in received]
     for message in MESSAGES:
         if message.name in received:
-            inputs += [f"{message.name}.{signal}" for signal in own_signals(message)]
-    outputs = [f"{name}.{what}" for name in sent for what in ("fresh", "payload")]
+            for name in own_signals(message):
+                is_raw = getattr(message, name).scale == 1.0
+                inputs.append(Port(f"{message.name}.{name}", kind="number" if is_raw else "real"))
+    outputs = [Port(f"{name}.fresh") for name in sent]
+    outputs += [Port(f"{name}.payload", kind="whole") for name in sent]
     fmu = process.start(
         Wanted(
             str(file),
-            [Port(name) for name in inputs],
-            [Port(name) for name in (*outputs, *more)],
+            inputs,
+            [*outputs, *(Port(name) for name in more)],
             loaded.scenario.period_s,
             [Port(name) for name in more],
             start,

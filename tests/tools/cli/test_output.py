@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.table import Table
 
+from ato_hil.tools.cli import console
 from ato_hil.tools.cli.output import (
     Output,
     PlainConsole,
@@ -166,3 +167,10 @@ def test_figures_take_nothing_of_the_users_matplotlibrc() -> None:
             assert not matplotlib.rcParams["text.usetex"]
             assert matplotlib.rcParams["lines.linewidth"] == style.SETTINGS["lines.linewidth"]
         assert pictures.defaults()["text.usetex"] is False
+
+
+def test_a_name_with_control_characters_does_not_break_the_line_of_an_error(monkeypatch) -> None:
+    file = io.StringIO()
+    monkeypatch.setattr(console, "errors", PlainConsole(file=file, width=500))
+    console.fail("there is no variable a\nb\x1b[31m", 1)
+    assert file.getvalue() == "ato-hil: there is no variable a\\nb\\x1b[31m\n"
