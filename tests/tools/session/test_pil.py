@@ -73,6 +73,39 @@ def test_the_digest_on_every_board_is_that_of_sil(board: boards.Board) -> None:
     assert in_pil == in_sil
 
 
+# Three stops, 24 per mille down; a temporary speed before the second makes the train late.
+SERVICE = """
+base = "yizhuang"
+
+[profile]
+overtime_s = 10.0
+stops = [
+    { name = "A", position_m = 4300.0, dwell_s = 1.0 },
+    { name = "B", position_m = 4340.0, run_s = 18.0, dwell_s = 2.0 },
+    { name = "C", position_m = 4380.0, run_s = 18.0, dwell_s = 1.0 },
+]
+
+[control.yielding]
+
+[[atp.temporary]]
+from_m = 4310.0
+to_m = 4330.0
+speed_m_s = 2.5
+to_run = 1
+"""
+
+
+def test_a_late_service_and_one_in_time_have_the_digest_of_sil(tmp_path: Path) -> None:
+    file = tmp_path / "service.toml"
+    file.write_text(SERVICE)
+    runs = list(simulate(str(file), runs=2))
+    late_s = [[stop["arrival_late_s"] for stop in run.row["stops"]] for run in runs]
+    assert min(late_s[0]) > 1
+    assert max(map(abs, late_s[1])) < 0.3
+    in_pil, in_sil = digests(load(str(file)), "cailc", M4, 2)
+    assert in_pil == in_sil
+
+
 @pytest.fixture(scope="module")
 def short() -> Loaded:
     return load(str(SHORT))
