@@ -49,9 +49,10 @@ TICK_MASK = 0xFFFF
 CARS_MAX = 8
 HOLD, EMERGENCY_REQUEST = values("FORCE_CMD", "Mode", "hold emergency_request")
 
-# Of ATP: where it steps in, and what it demands, as in ATP_LIMIT; NaN where nothing of the kind is
+# Of ATP: its curves, and what it demands, as in ATP_LIMIT; NaN where nothing of the kind is
 # supervised.
 ATP_COLUMNS = (
+    "indication_speed_m_s",
     "warning_speed_m_s",
     "service_brake_speed_m_s",
     "emergency_brake_speed_m_s",
@@ -328,6 +329,7 @@ def show_supervision(params: Any, state: Any, truth: Any) -> None:
     """ATP's part of a row of truth."""
     curve = state.curve_m_s
     truth.permitted_speed_m_s = curve[atp.PERMITTED]
+    truth.indication_speed_m_s = or_none(curve[atp.INDICATION])
     truth.warning_speed_m_s = or_none(curve[atp.WARN])
     truth.service_brake_speed_m_s = or_none(curve[atp.SBI])
     truth.emergency_brake_speed_m_s = or_none(curve[atp.EBI])

@@ -352,6 +352,8 @@ def test_atp_is_told_on_the_bus_and_brakes_whatever_is_commanded():
     assert (demand == truth["supervision"]).all()
     assert {atp.NORMAL, atp.SERVICE_BRAKE} < set(demand)
     np.testing.assert_allclose(permitted, truth["permitted_speed_m_s"], atol=0.0051)
+    assert np.isfinite(truth["indication_speed_m_s"]).any()
+    assert np.nanmax(truth["indication_speed_m_s"] - truth["permitted_speed_m_s"]) <= 0
     assert not speed.any()
     assert (distance == np.floor(np.maximum(stops_m - truth["position_m"], 0))).all()
     assert abs(truth["speed_m_s"][-1]) < 1e-3

@@ -6,13 +6,23 @@ Of a line of trains they show the first.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from ato_hil.tools.papers import plots
 from ato_hil.tools.papers.style import LIMIT, REFERENCE, Drawing, legend_above, look, named, panels
-from ato_hil.tools.runs.folder import Folder
+from ato_hil.tools.runs.folder import Folder, Missing
+
+# Of ATP, beside the limit: how their fields begin, and their names in the standard.
+CURVES = {
+    "indication": "I",
+    "warning": "W",
+    "service_brake": "SBI",
+    "emergency_brake": "EBI",
+    "emergency_deceleration": "EBD",
+}
 
 
 def last_runs(folders: list[Folder]) -> list[int]:
@@ -21,10 +31,14 @@ def last_runs(folders: list[Folder]) -> list[int]:
 
 
 def speed(folders: list[Folder]) -> Figure:
-    """Speed in the last run, with reference and limit."""
+    """Speed in the last run, with reference, limit and the curves that ATP supervises."""
     figure, (axes,) = panels()
     first = folders[0]
     limit = first.series("truth/permitted_speed_m_s", last_runs(folders)[0])
+    for field, label in CURVES.items():
+        with suppress(Missing):  # most sessions have no ETCS curves
+            curve = first.series(f"truth/{field}_speed_m_s", last_runs(folders)[0])
+            axes.plot(curve.time_s, curve.line, label=label, linewidth=0.6)
     bounded = np.where(np.isfinite(limit.line), limit.line, np.nan)
     axes.plot(limit.time_s, bounded, label="limit", **LIMIT)
     axes.plot(first.reference_time_s, first.profile.speed_m_s, label="reference", **REFERENCE)
@@ -33,7 +47,7 @@ def speed(folders: list[Folder]) -> Figure:
         axes.plot(drawn.time_s, drawn.line, label=label, **look(index, dashed=True))
     axes.set_ylabel("speed [m/s]")
     axes.set_xlabel(plots.SECONDS)
-    legend_above(figure, axes, columns=2)
+    legend_above(figure, axes, columns=4 if len(axes.lines) > 4 else 2)
     return figure
 
 

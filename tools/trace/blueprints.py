@@ -32,6 +32,7 @@ BARS = (
 
 # Of ATP's curves, beside the permitted speed; colours as in `plots.SUPERVISION`.
 CURVES = {
+    "indication_speed_m_s": "indication brown",
     "warning_speed_m_s": "warning yellow",
     "service_brake_speed_m_s": "SBI pink",
     "emergency_brake_speed_m_s": "EBI violet",

@@ -33,6 +33,7 @@ from ato_hil.tools.trace.colours import (
     APART,
     BEHIND,
     BLUE,
+    BROWN,
     COMMANDED,
     GREY,
     MEASURED,
@@ -167,6 +168,7 @@ LANES = (
 # True speeds that supervise the train, where the plant has them; they are drawn beside its own.
 SUPERVISION = {
     "permitted_speed_m_s": PERMITTED,
+    "indication_speed_m_s": BROWN,
     "warning_speed_m_s": YELLOW,
     "service_brake_speed_m_s": PINK,
     "emergency_brake_speed_m_s": VIOLET,

@@ -459,6 +459,9 @@ def test_a_law_of_ones_own_gets_neutral_figures_that_name_their_runs(tmp_path: P
             *("speed", "errors", "acceleration", "position-error", "speed-error")
         ]
         assert all(each.figure is not None for each in drawn)
+        assert drawn[0].figure is not None
+        lines = drawn[0].figure.axes[0].lines
+        assert [line.get_label() for line in lines][:5] == ["I", "W", "SBI", "EBI", "EBD"]
         assert [each.caption for each in drawn][:2] == [
             "Speed and its limit in run 3",
             "Errors of position and speed in run 3",
