@@ -282,7 +282,8 @@ def doctor() -> None:
     """Say what works on this machine, and what to do about what does not."""
     from ato_hil.tools.cli import doctor as checks
 
-    findings = checks.examine()
+    with working("trying what there is ..."):
+        findings = checks.examine()
     colours = {"works": "", "absent": "yellow", "broken": "red"}
     rows = [Row((each.what, each.state, each.text), colours[each.state]) for each in findings]
     names = ("what", "state", "how it was checked, and what to do")

@@ -150,7 +150,7 @@ def figures(
     kinds = [kind.value for kind in formats or (Picture.png, Picture.svg)]
     target = out or folders[0] / "figures"
     files = []
-    with one_line_for_bad_input():
+    with one_line_for_bad_input(), working(f"reading {folders[0]} ..."):
         for drawn in draw.figures([read(folder) for folder in folders]):
             if drawn.figure is None:
                 say(f"{drawn.stem}: not drawn: {drawn.why_not}")
@@ -170,6 +170,6 @@ def report(
     from ato_hil.tools.reports import report as page
 
     target = out or folder / "report.html"
-    with one_line_for_bad_input():
+    with one_line_for_bad_input(), working(f"reading {folder} ..."):
         page.write(folder, target)
     say(f"report  {target}")

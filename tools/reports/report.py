@@ -27,6 +27,7 @@ ELSEWHERE = ("schema", "digest_repeats", "runs", "timing", "faults_file")
 SOURCES = ("versions", "machine", "configuration", "controller")
 KNOWN = (*SESSION, *DIGESTS, *ELSEWHERE, *SOURCES)
 PICTURE_DPI = 130
+NARROW = 4  # columns that a telephone shows beside each other
 
 CSS = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1b1b1b; max-width: 64rem;
@@ -41,13 +42,23 @@ th { font-weight: 600; }
 td { overflow-wrap: break-word; }
 td:first-child, th:first-child, .plain td, .plain th { text-align: left; }
 .plain td { font-family: ui-monospace, monospace; overflow-wrap: anywhere; }
-figure { margin: 1rem 0; display: inline-block; vertical-align: top; }
+figure { margin: 1rem 0; display: inline-block; vertical-align: top; max-width: 100%; }
 figure img { max-width: 100%; }
 figcaption { font-size: .8rem; color: #444; max-width: 28rem; }
 pre { background: #f6f6f6; padding: .7rem; white-space: pre-wrap; overflow-wrap: anywhere;
   font-size: .8rem; }
 .bad { color: #a40000; font-weight: 600; }
 .quiet { color: #555; font-size: .8rem; }
+h1, p, th, li { overflow-wrap: anywhere; }
+@media (max-width: 50rem) {
+  td { overflow-wrap: anywhere; }
+  .wide, .wide tbody { display: block; }
+  .wide tr { display: block; padding: .5rem 0; border-bottom: 1px solid #ccc; }
+  .wide tr:first-child { display: none; }
+  .wide td, .wide td:first-child { display: flex; justify-content: space-between; gap: 1rem;
+    padding: .1rem 0; border: 0; }
+  .wide td::before { content: attr(data-of); color: #555; text-align: left; }
+}
 """
 
 
@@ -186,7 +197,9 @@ def _others(rows: list[dict[str, Any]], summary: dict[str, Any]) -> list[str]:
         if key in KNOWN or not entries:
             continue
         single = len(entries) == 1
-        parts.append(section(title_of(key), pairs(entries[0]) if single else table(entries)))
+        parts.append(
+            section(title_of(key), pairs(entries[0], exact=False) if single else table(entries))
+        )
     return parts
 
 
@@ -213,20 +226,26 @@ def _flat(value: dict[str, Any], stem: str = "") -> dict[str, Any]:
 
 
 def table(rows: Iterable[dict[str, Any]], title: Callable[[str], str] = title_of) -> str:
-    """A row a row, a column a key; what heads a column is the key's title."""
+    """A row a row, a column a key; what heads a column is the key's title. Where the page is narrow
+    each cell of a wide table is a line with its title."""
     rows = list(rows)
     keys = list(dict.fromkeys(key for row in rows for key in row))
-    head = "".join(f"<th>{escape(title(key))}</th>" for key in keys)
+    titles = {key: escape(title(key)) for key in keys}
+    head = "".join(f"<th>{name}</th>" for name in titles.values())
+    wide = len(keys) > NARROW
+    begin = {key: f'<td data-of="{name}">' if wide else "<td>" for key, name in titles.items()}
     body = "\n".join(
-        f"<tr>{''.join(f'<td>{_cell(row.get(key))}</td>' for key in keys)}</tr>" for row in rows
+        f"<tr>{''.join(f'{begin[key]}{_cell(row.get(key))}</td>' for key in keys)}</tr>"
+        for row in rows
     )
-    return f"<table>\n<tr>{head}</tr>\n{body}\n</table>"
+    kind = ' class="wide"' if wide else ""
+    return f"<table{kind}>\n<tr>{head}</tr>\n{body}\n</table>"
 
 
-def pairs(values: dict[str, Any]) -> str:
+def pairs(values: dict[str, Any], *, exact: bool = True) -> str:
     """A row a key."""
     rows = "\n".join(
-        f"<tr><th>{escape(key.replace('_', ' '))}</th><td>{_cell(value, exact=True)}</td></tr>"
+        f"<tr><th>{escape(key.replace('_', ' '))}</th><td>{_cell(value, exact=exact)}</td></tr>"
         for key, value in values.items()
     )
     return f'<table class="plain">\n{rows}\n</table>' if values else ""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import tomllib
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -273,4 +275,21 @@ def test_numbers_are_those_of_the_terminal_with_a_date_and_nothing_scrolls(tmp_p
     assert "0.01234567" not in text.partition("Again")[0]
     assert "2026-02-03T04:05:06+00:00" in parsed.sections["Session"]
     assert "overflow-x" not in text
-    assert max(row.count("<td>") for row in text.split("<tr>")) <= 11
+    assert max(row.count("<td") for row in text.split("<tr>")) <= 11
+
+
+def test_a_wide_table_is_a_line_a_cell_on_a_telephone() -> None:
+    keys = ["run", "stop_error_m", "a<b", "late_s", "margin_m_s"]
+    wide = report.table([dict.fromkeys(keys, 1.5)], title=str)
+    assert re.findall(r'<td data-of="([^"]*)">1.5</td>', wide) == [escape(key) for key in keys]
+    assert 'class="wide"' in wide
+    narrow = report.table([dict.fromkeys(keys[: report.NARROW], 1.5)])
+    assert "data-of" not in narrow
+    assert "wide" not in narrow
+    assert "attr(data-of)" in report.CSS
+
+
+def test_what_a_session_measured_has_sensible_digits(tmp_path: Path) -> None:
+    cost = {"bytes": 29608936, "us_per_frame": 0.38946893685252654}
+    parsed, _text = text_of(folder(tmp_path, trace=cost))
+    assert {"29608936", "0.3895"} <= set(parsed.sections["Trace"].split())
