@@ -15,6 +15,7 @@ from ato_hil.can_dbc.codec import MESSAGES
 from ato_hil.tools.runs import units
 from ato_hil.tools.runs.folder import LIMITS, STATE
 from ato_hil.tools.trace.charts import room
+from ato_hil.tools.trace.colours import TRUE
 from ato_hil.tools.trace.plots import PLOTS, SUPERVISION
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ class Layout:
     fields: tuple[str, ...] = ()  # of the plant's true state
     words: tuple[str, ...] = ()  # of the learning memory, as `charts` names them
     timing: bool = False
+    targets: bool = False  # ATP has announced one
 
 
 def title_of(name: str) -> str:
@@ -126,21 +128,26 @@ def plot(
     *entities: str,
     legend: bool = True,
     shown: Mapping[str, Sequence[bool]] | None = None,
+    true: str = "",
 ) -> rrb.TimeSeriesView:
     """A plot over all of the time.
 
     :param shown: which of its lines, of an entity that has others besides.
+    :param true: the entity of the true state, which is green beside what was measured; elsewhere
+        its colour may tell runs or trains apart.
     """
     import rerun as rr
     import rerun.blueprint as rrb
 
+    lines = dict(shown or {})
+    told = {entity: rr.SeriesLines(visible_series=which) for entity, which in lines.items()}
+    if true:
+        which = lines.get(true, [True])
+        told[true] = rr.SeriesLines(visible_series=which, colors=[TRUE] * len(which))
     return rrb.TimeSeriesView(
         name=name,
         contents=[f"/{entity}" for entity in entities],
-        overrides={
-            f"/{entity}": rr.SeriesLines(visible_series=lines)
-            for entity, lines in (shown or {}).items()
-        },
+        overrides={f"/{entity}": each for entity, each in told.items()},
         axis_x=_all_time(),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
     )
@@ -212,6 +219,7 @@ def _overview(layout: Layout) -> rrb.Container:
     current, reference = layout.current, _reference(layout)
     curves = [field for field in CURVES if field in layout.fields]
     supervised = "".join(f", {CURVES[field]}" for field in curves)
+    target = layout.targets and not curves
     forces = (
         plot("Force by car [N]", f"bus/car_force/{current}")
         if layout.car_forces
@@ -221,14 +229,14 @@ def _overview(layout: Layout) -> rrb.Container:
         rrb.Vertical(
             plot(
                 "Speed: measured blue, reference orange, permitted red"
-                f"{supervised or ', target pink'} [m/s]",
+                f"{', target pink' if target else supervised} [m/s]",
                 f"bus/motion/{current}",
                 f"reference/speed_m_s{reference}",
                 f"truth/{LIMITS}/{current}",
                 legend=False,
                 # The permitted speed is on the bus already.
                 shown=_motion(
-                    layout, "Speed", "PermittedSpeed", *(() if curves else ("TargetSpeed",))
+                    layout, "Speed", "PermittedSpeed", *(("TargetSpeed",) if target else ())
                 )
                 | _true(layout, LIMITS, *CURVES),
             ),
@@ -254,6 +262,14 @@ def _motion(layout: Layout, *signals: str) -> dict[str, list[bool]]:
     (motion,) = (each for each in PLOTS if each.name == "motion")
     lines = [line.signal in signals for line in motion.lines]
     return {f"bus/{motion.name}/{layout.current}": lines}
+
+
+def _behind(layout: Layout, name: str, title: str) -> rrb.TimeSeriesView:
+    """A plot of what the train shown, which leads the line, hears of the train behind."""
+    (heard,) = (each for each in PLOTS if each.name == name)
+    entity = f"bus/{name}/{layout.current}"
+    lines = [line.label.startswith("behind") for line in heard.lines]
+    return plot(title, entity, shown={entity: lines})
 
 
 def _true(
@@ -309,12 +325,15 @@ def _bus(layout: Layout) -> rrb.Container:
     import rerun.blueprint as rrb
 
     current = layout.current
-    ages = [plot("Age of the radio data [s]", f"bus/neighbour_age/{current}")]
     return rrb.Horizontal(
         rrb.Vertical(
             plot("Load by message, each second [kbit/s]", f"bus/load/{current}/**"),
             plot("Longest silence of a message, each second [ms]", f"bus/silence/{current}/**"),
-            *(ages if layout.trains > 1 else ()),
+            *(
+                [_behind(layout, "neighbour_age", "Age of what is heard of the train behind [s]")]
+                if layout.trains > 1
+                else ()
+            ),
         ),
         rrb.Vertical(
             lanes(
@@ -353,9 +372,15 @@ def _signals(layout: Layout) -> rrb.Container:
     import rerun.blueprint as rrb
 
     current, reference = layout.current, _reference(layout)
+    state = f"truth/{STATE}/{current}"
+    errors = (
+        ("Position error", "position_error", "position_error_m", "m"),
+        ("Speed error", "speed_error", "speed_error_m_s", "m/s"),
+    )
+    target = plot("Distance to the ATP target [m]", f"bus/target_distance/{current}", legend=False)
     radio = (
-        plot("Position of the neighbours [m]", f"bus/neighbour_position/{current}"),
-        plot("Speed of the neighbours [m/s]", f"bus/neighbour_speed/{current}"),
+        _behind(layout, "neighbour_position", "Position of the train behind [m]"),
+        _behind(layout, "neighbour_speed", "Speed of the train behind [m/s]"),
         plot("Timetable against the common one [m]", f"bus/rebased_position/{current}"),
         plot("Speed of the timetable [m/s]", f"bus/rebased_speed/{current}"),
     )
@@ -371,24 +396,30 @@ def _signals(layout: Layout) -> rrb.Container:
             "Acceleration: measured blue, true green, reference orange [m/s²]",
             f"bus/motion/{current}",
             f"reference/acceleration_m_s2{reference}",
-            f"truth/{STATE}/{current}",
+            state,
             legend=False,
             shown=_motion(layout, "Acceleration") | _true(layout, STATE, "acceleration_m_s2"),
+            true=state,
         ),
         plot(
             "Force: commanded blue, true green [N]",
             f"bus/force/{current}",
-            f"truth/{STATE}/{current}",
+            state,
             legend=False,
             shown=_true(layout, STATE, "force_n"),
+            true=state,
         ),
-        plot(
-            "Position error [m]",
-            f"bus/position_error/{current}",
-            f"truth/position_error_m/{current}",
+        *(
+            plot(
+                f"{title}: as the controller sees it blue, true green [{unit}]",
+                f"bus/{seen}/{current}",
+                f"truth/{error}/{current}",
+                legend=False,
+                true=f"truth/{error}/{current}",
+            )
+            for title, seen, error, unit in errors
         ),
-        plot("Speed error [m/s]", f"bus/speed_error/{current}", f"truth/speed_error_m_s/{current}"),
-        plot("Distance to the ATP target [m]", f"bus/target_distance/{current}"),
+        *((target,) if layout.targets else ()),
         *(radio if layout.trains > 1 else ()),
         grid_columns=3,
         name="Signals",
@@ -401,6 +432,7 @@ def _events(layout: Layout) -> rrb.Container:
     return rrb.Vertical(
         lanes("All states", f"bus/state/{layout.current}"),
         rrb.TextLogView(name="Events", origin="/events"),
+        row_shares=[5, 4],  # every lane of a single train has room
         name="Events",
     )
 

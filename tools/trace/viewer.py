@@ -305,8 +305,14 @@ def _settled(viewer: ViewerClient) -> bytes:
     picture = b""
     while True:
         time.sleep(SETTLE_S)
-        before, picture = picture, viewer.take_screenshot()
-        if picture == before or time.monotonic() > deadline:
+        before, late = picture, time.monotonic() > deadline
+        try:
+            picture = viewer.take_screenshot()
+        except TimeoutError:  # a large trace is loaded meanwhile
+            if late:
+                raise
+            continue
+        if picture == before or late:
             return picture
 
 

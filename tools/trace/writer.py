@@ -181,6 +181,7 @@ class TraceWriter:
         self._layout: Layout | None = None
         self._layout_of_file: Layout | None = None
         self._fields: tuple[str, ...] = ()  # of the plant's state
+        self._targets = False  # ATP has announced one
         self._states: dict[str, int] = {}  # last value of each lane, by its entity
         self._traffic: dict[int, tuple[int, Traffic, Checks]] = {}  # run and state, by train
         self._memory: dict[int, np.ndarray] = {}  # [words, positions], by run
@@ -233,6 +234,9 @@ class TraceWriter:
             self._show()
         for plot in self._plots:
             ticks, values = table_of(plot, found)
+            if plot.name == "target_distance" and not (self._targets or np.isnan(values).all()):
+                self._targets = True
+                self._show()
             names = [line.label for line in plot.lines]
             colours = [line.colour for line in plot.lines]
             widths = [line.width for line in plot.lines]
@@ -448,6 +452,7 @@ class TraceWriter:
             fields=self._fields,
             words=self._words if self._memory else (),
             timing=any(entity.startswith("timing/") for entity in self._logged),
+            targets=self._targets,
         )
         if layout != self._layout:
             self._layout = layout

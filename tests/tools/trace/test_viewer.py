@@ -11,6 +11,7 @@ from rerun.chunk import RrdReader
 from typer.testing import CliRunner
 
 from ato_hil.tools.cli.main import app
+from ato_hil.tools.trace import viewer
 from ato_hil.tools.trace.viewer import (
     COMPARED,
     ViewError,
@@ -171,3 +172,23 @@ def test_the_command_fails_with_one_line(tmp_path: Path, monkeypatch: pytest.Mon
         assert result.exit_code == 1
         assert "the viewer is not installed" in result.output
     assert not (tmp_path / "x.png").exists()
+
+
+def test_a_picture_waits_for_a_viewer_that_is_still_loading(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(viewer, "SETTLE_S", 0.0)
+    answers: list[Any] = [TimeoutError("deadline"), b"half", TimeoutError("deadline"), b"a", b"a"]
+
+    class Loading:
+        def take_screenshot(self) -> bytes:
+            answer = answers.pop(0)
+            if isinstance(answer, Exception):
+                raise answer
+            return bytes(answer)
+
+    assert viewer._settled(Loading()) == b"a"  # type: ignore[arg-type]
+    monkeypatch.setattr(viewer, "SETTLE_TIMEOUT_S", -1.0)
+    answers.append(TimeoutError("deadline"))
+    with pytest.raises(TimeoutError):
+        viewer._settled(Loading())  # type: ignore[arg-type]
