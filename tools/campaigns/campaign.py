@@ -31,6 +31,7 @@ from ato_hil.tools.campaigns.campaign_file import (
     here,
     unpack,
 )
+from ato_hil.tools.campaigns.distributions import scipy_stats
 from ato_hil.tools.runs import environment
 from ato_hil.tools.runs.files import write_json
 from ato_hil.tools.runs.result import Run
@@ -104,8 +105,10 @@ def check(campaign: Campaign, note: Callable[[str], None]) -> int:
     """Tries the scenarios of a campaign before the first run: all, or where there are many, those
     at the ends of what varies; says so. Returns how many runs there will be.
 
-    Raises CampaignError, and what `job.check` raises, for the first that is wrong.
+    Raises CampaignError, and what `job.check` raises, for the first that is wrong; InputError
+    without SciPy, which the statistics will need.
     """
+    scipy_stats()
     folder = _folder_of(tuple(campaign.files.items()))
     each = len(campaign.plans) * len(campaign.laws)
     points: Iterable[int] = range(campaign.points)
@@ -165,7 +168,7 @@ def run(
     todo = [number for number in range(total) if number not in done]
     outcome.runs = sum(kept_rows.count(folder, number) for number in done)
     progress(outcome.runs)
-    tasks = (_batch(campaign, number, size, mark) for number in todo)
+    tasks = (batch(campaign, number, size, mark) for number in todo)
     ended = 0
     try:
         with closing(spread(measure, tasks)) as made:
@@ -267,7 +270,8 @@ def _batch_size(campaign: Campaign) -> int:
     return max(int(min(max(wanted, LEAST_TICKS / ticks), MOST_TICKS / ticks)), 1)
 
 
-def _batch(campaign: Campaign, number: int, size: int, mark: str) -> Batch:
+def batch(campaign: Campaign, number: int, size: int, mark: str) -> Batch:
+    """Batch `number` of those of `size` sessions; `mark` as `mark_of`."""
     last = min((number + 1) * size, campaign.sessions)
     sessions = [campaign.session(each) for each in range(number * size, last)]
     return Batch(

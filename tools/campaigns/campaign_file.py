@@ -34,6 +34,7 @@ from ato_hil.can_dbc import settings
 from ato_hil.can_dbc.errors import InputError, validation
 from ato_hil.controller.registry import is_file, law_label
 from ato_hil.plant_sim import scenario as scenarios
+from ato_hil.tools.campaigns import distributions
 from ato_hil.tools.campaigns.sweep import CASE, put
 from ato_hil.tools.campaigns.varied import WAYS, Grid, Varied
 from ato_hil.tools.runs import expect, toml
@@ -316,8 +317,6 @@ def _samples(path: Path, file: File) -> np.ndarray:
     drawn = [each for each in file.vary if each.drawn]
     if not drawn:
         return np.zeros((1, 0))
-    from ato_hil.tools.campaigns import distributions
-
     try:
         return distributions.samples(drawn, file.samples, file.sampling, file.sampling_seed)
     except ValueError as error:

@@ -258,7 +258,10 @@ def _bench_campaign(runs: int) -> None:
         from ato_hil.tools.bench import campaigns
 
         figures = list(campaigns.measure(runs, update))
-    rows = [Row((f.what, f"{f.value:.3g} {f.unit}".strip(), f.goal)) for f in figures]
+    rows = [
+        Row((f.what, f"{f.value:.3g} {f.unit}".strip(), f.goal), "red" if f.missed else "")
+        for f in figures
+    ]
     names = (Column("campaign", text=True), Column("measured"), Column("goal"))
     show(console, names, rows)
 

@@ -368,7 +368,7 @@ def test_the_number_of_runs_costs_no_memory(file: Path, tmp_path: Path) -> None:
     def peak(seeds: int) -> int:
         file.write_text(PLAIN.replace("seeds = 4", f"seeds = {seeds}"))
         asked = read(file)
-        first = campaign.measure(campaign._batch(asked, 0, 1, campaign.mark_of(asked)))
+        first = campaign.measure(campaign.batch(asked, 0, 1, campaign.mark_of(asked)))
 
         def at_once(_function: Any, tasks: Iterable[Any]) -> Made:
             for index, task in enumerate(tasks):
@@ -440,7 +440,7 @@ def test_a_batch_that_is_lost_is_named_and_the_rest_is_kept(file: Path, tmp_path
 
 def test_a_worker_with_another_program_is_refused(file: Path, monkeypatch: Any) -> None:
     asked = read(file)
-    batch = campaign._batch(asked, 0, 1, campaign.mark_of(asked))
+    batch = campaign.batch(asked, 0, 1, campaign.mark_of(asked))
     monkeypatch.setattr(campaign, "source_digest", lambda: "another")
     with pytest.raises(InputError, match="another version of ato-hil"):
         campaign.measure(batch)
@@ -498,6 +498,21 @@ def test_a_trace_that_the_disk_does_not_take_is_named_and_the_rest_is_there(
     assert (again.command != "", again.trace) == (True, "")
     assert not (tmp_path / "o" / "worst" / "01" / worst.TRACE).exists()
     assert json.loads((tmp_path / "o" / campaign.FILE).read_text())["whole"] is True
+
+
+def test_a_worker_does_not_load_scipy() -> None:
+    code = "import ato_hil.tools.campaigns.campaign, sys; print('scipy.stats' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout == "False\n"
+
+
+def test_without_scipy_no_run_begins(file: Path, monkeypatch: Any) -> None:
+    distributions.scipy_stats.cache_clear()
+    file.write_text(FILE.partition("[[vary]]")[0])
+    asked = read(file)
+    monkeypatch.setitem(sys.modules, "scipy", None)
+    with pytest.raises(InputError, match=r"needs SciPy.*pip install 'ato-hil\[campaign\]'"):
+        campaign.check(asked, print)
 
 
 # The command.
