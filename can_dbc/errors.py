@@ -43,6 +43,7 @@ def validation(error: msgspec.ValidationError, kind: Any, key: str = "") -> Trou
     place = place.rstrip("`")
     if unknown := UNKNOWN_FIELD.fullmatch(text):
         known = _fields(msgspec.inspect.type_info(kind), re.findall(r"\[[^]]*\]|\w[\w-]*", place))
+        known = [name for name in known if name != unknown[1]]  # that of another kind of object
         text = f"{text}, {expected(unknown[1], known)}" if known else text
     return Trouble(f"{key}{place}".lstrip("."), text)
 

@@ -34,6 +34,11 @@ def test_all_names_are_listed_where_none_is_alike() -> None:
             "train",
             "unknown field `mass_kgs`, did you mean mass_kg or masses_kg?",
         ),
+        (  # that of another model is not suggested
+            {"train": {"model": "lumped", "mass_kg": 1}},
+            "train",
+            "unknown field `mass_kg`, did you mean masses_kg?",
+        ),
         (
             {"line": {"trains": 2, "spacing_m": 1.0, "faults": [{"trian": 1}]}},
             "line.faults[0]",
