@@ -1,6 +1,6 @@
 """How fast the bench is, as ratios to a peer in the same run: HIL against a bare python-can echo of
-its frames, SIL against python-control. What can disturb a pair is measured in turns, the best of
-each counts: what else the machine does only slows them."""
+its frames, SIL against python-control, FMUs against both. What can disturb a pair is measured in
+turns, the best of each counts: what else the machine does only slows them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from ato_hil.plant_sim.fmi.process import FmuError
 from ato_hil.plant_sim.scenario import load
 from ato_hil.tools.bench import echo
 from ato_hil.tools.export import ExportError, closed_loop
+from ato_hil.tools.export.fmu import archive, controller, plant
 from ato_hil.tools.session import in_process, session
 from ato_hil.tools.session.options import Silent
 from ato_hil.tools.trace import live_viewer
@@ -57,6 +59,11 @@ def measure(bus: str) -> Iterator[Figure]:
     bare = partial(echo.rate, bus, frames)
     with_echo = _with_peer(partial(hil_rate, bus), "bare python-can echo of its frames", bare)
     yield Figure("HIL, three processes, trace on", *with_echo)
+    with suppress(ExportError, FmuError):  # without a C compiler, or FMPy, there is none
+        fmus, sil, hil = fmu_rates(bus)
+        what = "FMUs as controller and plant"
+        yield Figure(f"{what}, trace off", fmus, "HIL of the same runs", hil)
+        yield Figure("SIL of the same runs", sil, what, fmus)
     with suppress(live_viewer.ViewerError):  # without a viewer there is nothing to measure
         alone, watched = watched_rates(bus)
         yield Figure("HIL, viewer looking on", watched, "HIL without it", alone)
@@ -164,9 +171,37 @@ def control_rate() -> float | None:
 
 def hil_rate(bus: str, viewer: live_viewer.LiveView | None = None) -> float:
     """Median rate of three HIL runs with recorder and trace, ticks/s."""
+    return run_rate("hil", bus, viewer=viewer)
+
+
+def fmu_rates(bus: str) -> tuple[float, float, float]:
+    """Rates of FMUs as controller and plant, of SIL and of HIL, the same runs without a trace,
+    ticks/s.
+
+    Raises ExportError without a C compiler, FmuError without FMPy.
+    """
+    loaded = load(HIL_SCENARIO)
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as folder:
-        options = session.Options(
-            HIL_SCENARIO, None, 3, "hil", bus, 1, Path(folder), None, viewer=viewer
-        )
+        files = {}
+        for part, module in (("controller_fmu", controller), ("plant_fmu", plant)):
+            files[part] = Path(folder) / f"{part}.fmu"
+            if missing := archive.write(module.unpacked(loaded, None), files[part]):
+                raise ExportError(missing)
+        turns = [
+            (
+                run_rate("fmu", "none", trace=False, **files),
+                run_rate("sil", "none", trace=False),
+                run_rate("hil", bus, trace=False),
+            )
+            for _ in range(TURNS)
+        ]
+    fmus, sil, hil = (max(rates) for rates in zip(*turns, strict=True))
+    return fmus, sil, hil
+
+
+def run_rate(mode: str, bus: str, **more: Any) -> float:
+    """Median rate of three runs of a session, ticks/s."""
+    with tempfile.TemporaryDirectory(prefix="ato-hil-") as folder:
+        options = session.Options(HIL_SCENARIO, None, 3, mode, bus, 1, Path(folder), None, **more)
         summary = session.run(options, Silent())
     return float(np.median([row["ticks_per_s"] for row in summary["runs"]]))

@@ -21,7 +21,7 @@ from ato_hil.plant_sim.scenario import Loaded, load, members
 from ato_hil.plant_sim.trains import foreign
 from ato_hil.tools.runs import can_logs, limits, locks, onboard
 from ato_hil.tools.runs.onboard import EXTERNAL_LAW
-from ato_hil.tools.session import boards, processes
+from ato_hil.tools.session import boards, fmus, processes
 from ato_hil.tools.session.external_nodes import CONTROLLER, PLANT
 from ato_hil.tools.trace.budget import thinning
 from ato_hil.tools.trace.live_viewer import LiveView
@@ -170,9 +170,9 @@ def check(options: Options, held: ExitStack) -> Setup:
     """What was asked for, if it is good; `held` gets the locks of the files that the session
     writes.
 
-    Raises ScenarioError, LawError, CalibrationError, MemoryFileError, RecordError, FaultError or
-    SessionError for what is not good, LimitError for what the system does not give, LockedError for
-    a file that another session has.
+    Raises ScenarioError, LawError, CalibrationError, MemoryFileError, RecordError, FaultError,
+    FmuError or SessionError for what is not good, LimitError for what the system does not give,
+    LockedError for a file that another session has.
     """
     for name, value, least in (("runs", options.runs, 1), ("seed", options.seed, 0)):
         if value is not None and (not isinstance(value, int) or value < least):
@@ -204,6 +204,8 @@ def check(options: Options, held: ExitStack) -> Setup:
         if options.mode == "mil":
             raise SessionError(f"{loaded.path}: a train that is an FMU needs another mode than mil")
         foreign.Host(loaded.scenario.train, loaded.path.parent, loaded.scenario.period_s)
+    if options.mode == "fmu":
+        _try_fmus(options, loaded, runs)
     if options.record is not None:
         can_logs.check_target(options.record)
         held.enter_context(locks.file_held(options.record))
@@ -240,6 +242,15 @@ def _refuse_what_fmus_have_not(options: Options, trains: list[Loaded]) -> None:
     for what, asked in (("memory file", options.memory), ("library", options.firmware)):
         if asked is not None and options.controller_fmu is not None:
             raise SessionError(f"{options.controller_fmu}: a controller FMU takes no {what}")
+
+
+def _try_fmus(options: Options, loaded: Loaded, runs: range) -> None:
+    """Raises FmuError for one that is not as it has to be."""
+    with ExitStack() as opened:
+        if options.controller_fmu is not None:
+            fmus.controller(options.controller_fmu, loaded, 0, opened)
+        if options.plant_fmu is not None:
+            fmus.world(options.plant_fmu, loaded, runs, options.seed, opened)
 
 
 def _refuse_without_clock(options: Options) -> None:

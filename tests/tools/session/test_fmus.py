@@ -103,6 +103,7 @@ def test_what_is_no_such_fmu_is_one_line(place, tmp_path, made):
     for name in ("train.fmu", "plain-train.fmu"):
         with pytest.raises(FmuError, match=r"train\.fmu: (the FMU of a plant|RUN_CTRL\.fresh is)"):
             made(controller_fmu=place / name)
+    assert not (tmp_path / "fmu").exists()  # the folder of the session
 
 
 def test_a_binary_for_another_machine_is_one_line(place, tmp_path, made):
