@@ -45,8 +45,9 @@ largest that train and track can give (with traction; without), so that curves d
 position alone and hold against any controller. T_cut_off, T_be and T_bs have one control period
 added, which passes before a crossing is seen. The gradient is the most downhill anywhere under the
 train; the resistance of the train does not count. While a brake builds up, the gradient acts
-through A_2, the steepest downhill's. Left out: curves for limits over time, K_n of the guidance
-curve.
+through A_2, the steepest downhill's; the standard has 0.4 m/s^2 at most. A temporary speed has the
+curves of a static one while it holds, wherever the train then is. Left out: curves for limits over
+time, K_n of the guidance curve.
 
 What holds, then, whatever the controller does: the train stops before the supervised location, and
 is nowhere above that location's EBD. At a ceiling, and near a lower static speed, the emergency
@@ -132,6 +133,11 @@ class TemporarySpeed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             raise ValueError(
                 f"to_run is {self.to_run}, expected from_run, {self.from_run}, or more"
             )
+
+    @property
+    def in_all_runs(self) -> bool:
+        """Whether every run has it."""
+        return self.from_run == 1 and self.to_run is None
 
     def holds_in(self, run: int) -> bool:
         """Whether run `run` has it."""

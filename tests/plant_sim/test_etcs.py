@@ -245,6 +245,17 @@ def _row(above, values, v):
 
 
 @numba.njit(cache=False)
+def _gradient(from_m, slopes, length_m, front_m):
+    """The most downhill under the train, per mille."""
+    found = 0.0 if front_m - length_m < from_m[0] else np.inf
+    for i in range(len(from_m)):
+        end = from_m[i + 1] if i + 1 < len(from_m) else np.inf
+        if from_m[i] <= front_m and end > front_m - length_m:
+            found = min(found, slopes[i])
+    return found
+
+
+@numba.njit(cache=False)
 def _braked_from(above, values, from_m, slopes, length_m, foot_m, foot_m_s, v_end):
     """Where a train must begin to brake at `v_end` to pass the foot at its speed: the gradient is
     the most downhill of those under the train."""
@@ -257,19 +268,36 @@ def _braked_from(above, values, from_m, slopes, length_m, foot_m, foot_m_s, v_en
     for _ in range(steps):
         middle = v + h / 2
         front = x - middle * h / (2 * a)
-        gradient = 0.0 if front - length_m < from_m[0] else np.inf
-        for i in range(len(from_m)):
-            end = from_m[i + 1] if i + 1 < len(from_m) else np.inf
-            if from_m[i] <= front and end > front - length_m:
-                gradient = min(gradient, slopes[i])
-        a = _row(above, values, middle) + 9.81e-3 * gradient
+        a = _row(above, values, middle) + 9.81e-3 * _gradient(from_m, slopes, length_m, front)
         x -= middle * h / a
         v += h
     return x
 
 
-def exact_places(case, v):
-    """Where I, P, W, SBI and EBI are exactly for a speed."""
+@numba.njit(cache=False)
+def _rolled(from_m, slopes, length_m, x, v, time_s):
+    """Place and speed of a train that nothing but the gradient moves for a time."""
+    steps = int(np.ceil(time_s / 1e-3))
+    h = time_s / max(steps, 1)
+    for _ in range(steps):
+        a = -9.81e-3 * _gradient(from_m, slopes, length_m, x)
+        x += v * h + a * h * h / 2
+        v = max(v + a * h, 0.0)
+    return x, v
+
+
+@dataclass(frozen=True)
+class Exact:
+    """For a speed."""
+
+    places: tuple[float, ...]  # where I, P, W, SBI and EBI are exactly
+    full_m: float  # where the brake is full of a train that was intervened upon at EBI,
+    full_m_s: float  # how fast it then is,
+    braked_from_m: float  # and where EBD has that speed
+
+
+def exact(case, v):
+    """Of a speed; none where EBD does not go so low."""
     own = case.supervision
     above = np.array(
         sorted(
@@ -317,7 +345,9 @@ def exact_places(case, v):
         sbi = min(sbi, sbd - v * t_bs)
     permitted = sbi - v * own.t_driver_s
     indication = permitted - v * (max(0.8 * t_bs, 5.0) + own.t_driver_s)
-    return indication, permitted, sbi - v * own.t_warning_s, sbi, ebi
+    full = _rolled(*way, ebi + (real + d_1 / 2) * t_traction, real + d_1, t_berem)
+    ebd = _braked_from(above, safe, *way, case.foot_m, case.foot_m_s, max(full[1], case.foot_m_s))
+    return Exact((indication, permitted, sbi - v * own.t_warning_s, sbi, ebi), *full, ebd)
 
 
 def random_case(rng):
@@ -366,23 +396,27 @@ def random_case(rng):
     count = int(rng.integers(1, 12))
     from_m = np.round(np.cumsum(rng.uniform(50.0, 1500.0, count)), 1)
     slopes = np.round(rng.uniform(-25.0, 25.0, count), 1)
-    a_1, a_2 = float(rng.uniform(0.0, 1.0)), float(rng.uniform(0.0, 0.3))
+    a_1 = float(rng.uniform(0.0, 1.0))
+    a_2 = max(-9.81e-3 * float(min(slopes)), 0.0)  # as `world` takes it from the line
     return Case(own, from_m.tolist(), slopes.tolist(), foot, foot_m_s, a_1, a_2)
 
 
 def check(seed):
     """That no curve of a random train is ahead of the exact one, or 2 m behind it: the latter with
-    a short control period, which the times have on top."""
+    a short control period, which the times have on top. And that EBI leaves a train that rolls
+    down the line while its brake builds up on its EBD, or before it."""
     rng = np.random.default_rng(seed)
     case = random_case(rng)
     sections = track.sections(track.Track(from_m=case.from_m, resistance_n_per_kn=case.slopes))
     own = case.supervision, sections, case.a_1, case.a_2, 45.0
     limits, at_once = limits_for(*own), limits_for(*own, 1e-3)
     for v in rng.uniform(1.0, 45.0, 3):
-        found = exact_places(case, float(v))
+        found = exact(case, float(v))
         if found is None:
             continue
-        for kind, at in zip(KINDS, found, strict=True):
+        # While the brake builds up the gradient moves the train, and A_2 counts on it.
+        assert found.full_m <= found.braked_from_m + 0.02, (seed, v)
+        for kind, at in zip(KINDS, found.places, strict=True):
             floor = max(float(target["floor_m_s"][kind]) for target in limits.targets)
             if v < floor + 0.1 or at < -3000.0:
                 continue

@@ -6,7 +6,7 @@ import zipfile
 import pytest
 
 from ato_hil.plant_sim.fmi.process import FmuError
-from ato_hil.plant_sim.scenario import ScenarioError, load
+from ato_hil.plant_sim.scenario import ScenarioError, load, overlaid
 from ato_hil.tools.export.fmu import archive, controller, plant
 from ato_hil.tools.session import session
 from ato_hil.tools.session.options import Options, SessionError
@@ -132,6 +132,11 @@ def test_a_plant_that_ends_early_is_one_line(place, tmp_path, made):
 
 
 def test_a_plant_whose_runs_are_not_alike_is_refused():
-    for scenario, key in (("line-paper", "line"), ("crh3-learning", "run_length")):
+    lower = {"from_m": 500.0, "to_m": 600.0, "speed_m_s": 9.0, "to_run": 3}
+    for loaded, key in (
+        (load("line-paper"), "line"),
+        (load("crh3-learning"), "run_length"),
+        (overlaid("subway-atp", {"atp": {"temporary": [lower]}}), "atp.temporary"),
+    ):
         with pytest.raises(ScenarioError, match=f"key {key}: "):
-            plant.unpacked(load(scenario), None)
+            plant.unpacked(loaded, None)

@@ -82,6 +82,7 @@ def _refuse(loaded: Loaded) -> None:
         ("run_length", scenario.run_length is not None),
         ("changes", bool(scenario.changes)),
         ("start", scenario.start != Start()),
+        ("atp.temporary", any(not lower.in_all_runs for lower in scenario.atp.temporary)),
     ):
         if is_there:
             raise ScenarioError(
