@@ -79,7 +79,7 @@ def compare(
     for name in names:
         if name in loaded.scenario.tuning:
             say(f"gains of {name}: {loaded.scenario.tuning[name]}")
-    say(f"trace   {place.final / 'trace.rrd'}")
+    say(f"trace   {place.final / 'trace.rrd'}   (open it with: ato-hil view {place.final})")
 
 
 def sweep(

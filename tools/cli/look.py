@@ -72,7 +72,10 @@ def profile(
 def view(
     folders: Annotated[
         list[Path],
-        typer.Argument(metavar="DIR...", help="What `ato-hil run` wrote; several are overlaid."),
+        typer.Argument(
+            metavar="DIR...",
+            help="What `run`, `compare` or a campaign wrote; several sessions are overlaid.",
+        ),
     ],
     law_compare: Annotated[
         bool, typer.Option("--law-compare", help="Errors by run first, side by side.")
@@ -92,24 +95,22 @@ def view(
     from ato_hil.tools.trace import live_viewer
     from ato_hil.tools.trace import viewer as finished
 
-    with one_line_for_bad_input():
-        recorded = finished.load(folders)
-        with finished.prepared(recorded, law_compare) as trace:
-            if screenshot is not None:
-                finished.screenshot(trace, screenshot, tab)
-                say(f"picture {screenshot}")
-                return
-            kind = live_viewer.WEB if web else live_viewer.NATIVE
-            live_viewer.check(kind)
-            process, text = live_viewer.show(kind, [str(trace.resolve())])
-            say(text)
-            try:
-                status = process.wait()
-            except KeyboardInterrupt:
-                live_viewer.end(process)
-            else:
-                if status:
-                    raise fail(f"the viewer ended with exit status {status}", EXIT_BAD_INPUT)
+    with one_line_for_bad_input(), finished.prepared(folders, law_compare) as trace:
+        if screenshot is not None:
+            finished.screenshot(trace, screenshot, tab)
+            say(f"picture {screenshot}")
+            return
+        kind = live_viewer.WEB if web else live_viewer.NATIVE
+        live_viewer.check(kind)
+        process, text = live_viewer.show(kind, [str(trace.resolve())])
+        say(text)
+        try:
+            status = process.wait()
+        except KeyboardInterrupt:
+            live_viewer.end(process)
+        else:
+            if status:
+                raise fail(f"the viewer ended with exit status {status}", EXIT_BAD_INPUT)
 
 
 def table(

@@ -31,6 +31,8 @@ BARS = (
     "rms_speed_error_m_s",
 )
 
+SIGNED = ("stop_error_m",)  # bars have no sign
+
 # Of ATP's curves, beside the permitted speed; colours as in `plots.SUPERVISION`.
 CURVES = {
     "indication_speed_m_s": "indication brown",
@@ -56,9 +58,11 @@ class Layout:
     own_timetable: bool  # the run shown has a reference of its own
     length_m: float  # of the reference
     fields: tuple[str, ...] = ()  # of the plant's true state
+    curves: tuple[str, ...] = ()  # ATP's, of these, that are drawn beside the permitted speed
     words: tuple[str, ...] = ()  # of the learning memory, as `charts` names them
     timing: bool = False
     targets: bool = False  # ATP has announced one
+    laws: tuple[str, ...] = ()  # of the runs, where they are not runs of one law
 
 
 def title_of(name: str) -> str:
@@ -87,7 +91,7 @@ def of_several(columns: Sequence[str], numbers: Sequence[str], bars_first: bool)
 
     by_run = [
         rrb.BarChartView(
-            name=f"{title_of(key)} by run",
+            name=f"{title_of(key)} by run{', its size' if key in SIGNED else ''}",
             origin=f"/runs/{key}",
             # One legend is enough, where learning leaves room for it.
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=number == 0),
@@ -153,9 +157,9 @@ def plot(
     )
 
 
-def of_all(name: str, entity: str) -> rrb.TimeSeriesView:
+def of_all(name: str, entity: str, legend: bool = False) -> rrb.TimeSeriesView:
     """The same quantity of several runs, trains or sessions; their colours tell them apart."""
-    return plot(name, f"{entity}/**", legend=False)
+    return plot(name, f"{entity}/**", legend=legend)
 
 
 def chart(name: str, entity: str, length_m: float, below: bool = False) -> rrb.Spatial2DView:
@@ -171,12 +175,12 @@ def chart(name: str, entity: str, length_m: float, below: bool = False) -> rrb.S
     )
 
 
-def bars(key: str) -> rrb.BarChartView:
-    """A number of the summary by run."""
+def bars(key: str, laws: Sequence[str] = ()) -> rrb.BarChartView:
+    """A number of the summary by run; of a run of each law by law."""
     import rerun.blueprint as rrb
 
     return rrb.BarChartView(
-        name=f"{title_of(key)} by run",
+        name=f"{title_of(key)} by {'law: ' + ', '.join(laws) if laws else 'run'}",
         origin=f"/runs/bars/{key}",
         plot_legend=rrb.PlotLegend(visible=False),
     )
@@ -217,9 +221,9 @@ def _overview(layout: Layout) -> rrb.Container:
     import rerun.blueprint as rrb
 
     current, reference = layout.current, _reference(layout)
-    curves = [field for field in CURVES if field in layout.fields]
-    supervised = "".join(f", {CURVES[field]}" for field in curves)
-    target = layout.targets and not curves
+    named = bool(layout.laws)
+    supervised = "".join(f", {CURVES[field]}" for field in layout.curves)
+    target = layout.targets and not layout.curves
     forces = (
         plot("Force by car [N]", f"bus/car_force/{current}")
         if layout.car_forces
@@ -238,7 +242,7 @@ def _overview(layout: Layout) -> rrb.Container:
                 shown=_motion(
                     layout, "Speed", "PermittedSpeed", *(("TargetSpeed",) if target else ())
                 )
-                | _true(layout, LIMITS, *CURVES),
+                | _true(layout, LIMITS, *layout.curves),
             ),
             chart(
                 f"Over position: true green, reference orange, permitted red{supervised} [m/s, m]",
@@ -249,8 +253,8 @@ def _overview(layout: Layout) -> rrb.Container:
             row_shares=[5, 6, 6],
         ),
         rrb.Vertical(
-            of_all(f"Position error, {_order(layout)} [m]", "truth/position_error_m"),
-            of_all(f"Speed error, {_order(layout)} [m/s]", "truth/speed_error_m_s"),
+            of_all(f"Position error, {_order(layout)} [m]", "truth/position_error_m", named),
+            of_all(f"Speed error, {_order(layout)} [m/s]", "truth/speed_error_m_s", named),
             forces,
         ),
         name="Overview",
@@ -287,6 +291,8 @@ def _reference(layout: Layout) -> str:
 
 
 def _order(layout: Layout) -> str:
+    if layout.laws:
+        return "the last run of each law"
     return TRAINS if layout.trains > 1 else RUNS
 
 
@@ -307,8 +313,8 @@ def _learning(layout: Layout) -> rrb.Container:
     ]
     return rrb.Horizontal(
         rrb.Vertical(
-            rrb.Horizontal(*(bars(key) for key in BARS[:2])),
-            rrb.Horizontal(*(bars(key) for key in BARS[2:])),
+            rrb.Horizontal(*(bars(key, layout.laws) for key in BARS[:2])),
+            rrb.Horizontal(*(bars(key, layout.laws) for key in BARS[2:])),
             rrb.TextDocumentView(name="Summary", origin="/runs/table"),
         ),
         *([rrb.Vertical(*learned)] if learned else []),

@@ -82,12 +82,17 @@ def load(folders: Sequence[Path]) -> list[Recorded]:
     return [Recorded(*each) for each in zip(folders, names, summaries, strict=True)]
 
 
-def _summary(folder: Path) -> dict[str, Any]:
-    file = folder / "summary.json"
+def _trace(folder: Path) -> Path:
     if not folder.is_dir():
         raise ViewError(f"{folder}: no such folder, expected one that `ato-hil run` wrote")
-    if not (folder / "trace.rrd").is_file():
-        raise ViewError(f"{folder / 'trace.rrd'}: no such file, expected the trace of a session")
+    file = folder / "trace.rrd"
+    if not file.is_file():
+        raise ViewError(f"{file}: no such file, expected the trace of a session")
+    return file
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    file = _trace(folder).with_name("summary.json")
     try:
         summary = json.loads(file.read_text(encoding="utf-8"))
         if not isinstance(summary["runs"], list) or not isinstance(summary["law"], str):
@@ -100,11 +105,16 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def prepared(recorded: Sequence[Recorded], law_compare: bool = False) -> Iterator[Path]:
-    """A trace of these sessions: that of a single one, or a temporary one of several."""
-    if len(recorded) == 1 and not law_compare:
-        yield recorded[0].trace
+def prepared(folders: Sequence[Path], law_compare: bool = False) -> Iterator[Path]:
+    """A trace of these folders: that of a single one, whatever left it there (a session, `compare`,
+    a campaign), or a temporary one of several sessions.
+
+    Raises ViewError as `load` and `overlay` do.
+    """
+    if len(folders) == 1 and not law_compare:
+        yield _trace(folders[0])
         return
+    recorded = load(folders)
     with tempfile.TemporaryDirectory(prefix="ato-hil-") as scratch:
         file = Path(scratch) / "sessions.rrd"
         overlay(recorded, file, law_compare)

@@ -54,6 +54,7 @@ from ato_hil.tools.runs.frames import columns, estimate
 from ato_hil.tools.trace import charts
 from ato_hil.tools.trace.blueprints import (
     BARS,
+    CURVES,
     Layout,
     of_session,
     title_of,
@@ -181,6 +182,7 @@ class TraceWriter:
         self._layout: Layout | None = None
         self._layout_of_file: Layout | None = None
         self._fields: tuple[str, ...] = ()  # of the plant's state
+        self._curves: tuple[str, ...] = ()  # of these, ATP's that are drawn
         self._targets = False  # ATP has announced one
         self._states: dict[str, int] = {}  # last value of each lane, by its entity
         self._traffic: dict[int, tuple[int, Traffic, Checks]] = {}  # run and state, by train
@@ -307,7 +309,14 @@ class TraceWriter:
         if shown and {"position_m", "speed_m_s"} <= set(fields):
             # The limit is on the bus already; what else supervises the train is known here alone.
             self._fields = tuple(fields)
-            self._log_speed_over_position(run, table, fields)
+            permitted = [name for name in ("permitted_speed_m_s",) if name in fields]
+            self._curves = tuple(  # one that is the permitted speed itself would hide it
+                each
+                for each in CURVES
+                if each in fields
+                and not any(np.array_equal(table[each], table[name]) for name in permitted)
+            )
+            self._log_speed_over_position(run, table, (*permitted, *self._curves))
             self._show()
 
     def memory(self, run: int, cells: np.ndarray, decimation: int) -> None:
@@ -452,6 +461,8 @@ class TraceWriter:
             fields=self._fields,
             words=self._words if self._memory else (),
             timing=any(entity.startswith("timing/") for entity in self._logged),
+            curves=self._curves,
+            laws=self._names,
             targets=self._targets,
         )
         if layout != self._layout:

@@ -12,7 +12,7 @@ FIELDS = ("position_m", "acceleration_m_s2", "force_n")
 RGBA = int.from_bytes((*TRUE, 255))
 
 
-def views(trains: int = 1, targets: bool = False) -> dict[str, Any]:
+def views(trains: int = 1, targets: bool = False, laws: tuple[str, ...] = ()) -> dict[str, Any]:
     """The views of a session, by name."""
     layout = Layout(
         run="run_01",
@@ -24,6 +24,7 @@ def views(trains: int = 1, targets: bool = False) -> dict[str, Any]:
         length_m=100.0,
         fields=FIELDS,
         targets=targets,
+        laws=laws,
     )
 
     def inside(part: Any) -> Iterator[Any]:
@@ -69,3 +70,11 @@ def test_the_leading_train_hears_of_the_one_behind() -> None:
     for view in radio:
         (entity,) = view.visualizer_overrides
         assert override(view, entity, "visible_series") in ([False, True], [False, True] * 2)
+
+
+def test_runs_of_several_laws_are_told_apart_by_law() -> None:
+    names = " ".join(views(laws=("cailc", "pid")))
+    assert "violet is the first run" not in names
+    assert "by run" not in names
+    assert "Position error, the last run of each law [m]" in names
+    assert "Max position error [m] by law: cailc, pid" in names

@@ -17,6 +17,7 @@ from ato_hil.tools.trace.viewer import (
     ViewError,
     load,
     overlay,
+    prepared,
 )
 from ato_hil.tools.trace.writer import TraceWriter
 
@@ -142,6 +143,19 @@ def test_what_is_not_a_session_is_refused_in_one_line(tmp_path: Path) -> None:
     (good / "summary.json").unlink()
     with pytest.raises(ViewError, match=r"summary\.json: No such file"):
         load([good])
+
+
+def test_a_trace_alone_is_shown_whatever_left_it(tmp_path: Path) -> None:
+    alone = session(tmp_path / "worst", "cailc")
+    (alone / "summary.json").unlink()  # neither `compare` nor a campaign leaves one
+    with prepared([alone]) as trace:
+        assert trace == alone / "trace.rrd"
+    for folders, law_compare in (([alone], True), ([alone, alone], False)):
+        with (
+            pytest.raises(ViewError, match=r"worst/summary\.json: No such file"),
+            prepared(folders, law_compare),
+        ):
+            pass
 
 
 def test_a_damaged_trace_and_a_session_without_runs_cannot_be_overlaid(tmp_path: Path) -> None:

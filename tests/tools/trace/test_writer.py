@@ -572,6 +572,21 @@ def test_speed_and_what_supervises_it_are_drawn_over_position(tmp_path: Path) ->
     ]
 
 
+def test_a_warning_at_the_permitted_speed_does_not_hide_it(tmp_path: Path) -> None:
+    names = ("position_m", "speed_m_s", "permitted_speed_m_s", "warning_speed_m_s")
+    table = np.zeros(TICKS, np.dtype([(name, np.float64) for name in names]))
+    table["permitted_speed_m_s"] = table["warning_speed_m_s"] = 21.0
+    writer = open_writer(tmp_path / "trace.rrd")
+    writer.frames(1, random_frames(1))
+    writer.truth(1, table)
+    assert writer._layout is not None
+    assert writer._layout.curves == ()
+    writer.close()
+    written = Trace(tmp_path / "trace.rrd")
+    assert "/over_position/speed/warning_speed_m_s" not in written.static
+    assert "warning_speed_m_s" in written.lines("/truth/limits/run_01")
+
+
 def test_the_time_for_a_frame_is_known_after_the_first(tmp_path: Path) -> None:
     writer = open_writer(tmp_path / "trace.rrd")
     assert writer.us_per_frame is None
