@@ -203,7 +203,9 @@ def calibrate_track(gains: TrackGains, vehicle: Vehicle) -> np.ndarray:
     period, z1_max = vehicle.period_s, gains.z1_max_m
     params["z1_max"] = INT32_MAX if z1_max is None else fixed("z1_max_m", z1_max, 24)
     params["filter"] = fixed("error_filter_s", period / (gains.error_filter_s + period), 30)
-    params["hold"] = fixed("hold_force_n / M", -gains.hold_force_n / vehicle.mass_kg, 27)
+    # A light train has less than the force by default; the brake gives what it has.
+    hold = min(gains.hold_force_n / vehicle.mass_kg, vehicle.force_max_m_s2)
+    params["hold"] = fixed("hold_force_n / M", -hold, 27)
     params["characteristic"] = characteristic.calibrate(vehicle)
     return params
 

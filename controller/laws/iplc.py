@@ -30,7 +30,9 @@ limit is of the new estimate), finishes at tick k+1 for tick k and serves the ne
 Ours, not the paper's: dH_0 may look m ticks further ahead and u_{n-1}(k) may be its moving average
 over k-h .. k+h, without which learning diverges slowly where the actuator lags (m Ts ~ lag +
 delay); feedback kfv (v_d - v) + kfs (s_d - s) of the current run; run 0 is driven by the same form
-with `initial` (u_0 = 0 by default: the train stands); a limit on the slope of u.
+with `initial`, and by the share `initial_feed_forward` of what the reference asks for m + 1 ticks
+ahead and the track by the gradient map, a* + w(x) (u_0 = 0 by default: the train stands); a limit
+on the slope of u.
 
 | symbol      | unit      | format             | symbol      | unit          | format            |
 | v, dH_v, z_v, dv | m/s  | Q24                | s, dH_s, ds | m             | Q15               |
@@ -99,10 +101,10 @@ PARAMS = np.dtype(
         ("kfs", np.int32),  # 1/s^2, Q20
         ("initial_kfv", np.int32),  # the same in run 0
         ("initial_kfs", np.int32),
+        ("initial_feed_forward", np.int32),  # Q30
         ("gamma", np.int32),  # Q30
         ("mu", np.int32),  # m^2/s^2, Q17
         ("delta", np.int32),  # Q30
-        ("padding", np.int32),
     ],
     align=True,
 )
@@ -170,6 +172,8 @@ class CommonGains(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     kfv: Gain = 0.0  # 1/s: feedback of the speed error in a run
     kfs: Gain = 0.0  # 1/s^2: of the position error
     initial: tuple[Gain, Gain] = (0.0, 0.0)  # kfv, kfs of run 0
+    # Share of a* + w(x) that run 0 begins with.
+    initial_feed_forward: Annotated[float, msgspec.Meta(ge=0, lt=2)] = 0.0
     slope_max: NotNegative = 0.0  # N/kg/s: largest slope of the input; 0: free
 
 
@@ -236,6 +240,7 @@ def calibrate(gains: Gains, vehicle: Vehicle) -> np.ndarray:
     params["kfv"], params["kfs"] = fixed("kfv", gains.kfv, 20), fixed("kfs", gains.kfs, 20)
     for name, value in zip(("initial_kfv", "initial_kfs"), gains.initial, strict=True):
         params[name] = fixed("initial", value, 20)
+    params["initial_feed_forward"] = fixed("initial_feed_forward", gains.initial_feed_forward, 30)
     params["gamma"] = fixed("gamma", gains.gamma, 30)
     params["mu"] = max(fixed("mu", gains.mu, 17), 1)
     params["delta"] = max(fixed("delta", gains.delta, 30), 1)
@@ -464,6 +469,13 @@ def feedback(kfv: Int, kfs: Int, inputs: Record) -> Int:
 
 
 @step
+def feed_forward(params: Record, inputs: Record) -> Int:
+    """The share of a* + w(x) that run 0 begins with, N/kg, Q29: Q27 times Q30, below 2^62."""
+    asked = sat32(int64(inputs.ahead_acceleration) + int64(inputs.map_acceleration))
+    return round_shift(asked * int64(params.initial_feed_forward), 28)
+
+
+@step
 def limited_input(params: Record, state: Record, wanted: Int) -> Int:
     """`wanted` inside what slope and actuators allow, Q29."""
     force_max = int64(params.force_max)
@@ -512,6 +524,7 @@ def iplc(params: Record, state: Record, cell: Record, inputs: Record, outputs: R
     wanted = int64(state.plan[0]) + feedback(int64(params.kfv), int64(params.kfs), inputs)
     if initial == 1:  # takes as long as any other run, and plans to do the same in all that follow
         wanted = feedback(int64(params.initial_kfv), int64(params.initial_kfs), inputs)
+        wanted += feed_forward(params, inputs)
     u = limited_input(params, state, wanted)
     state.plan[0] = u
     if initial == 1:

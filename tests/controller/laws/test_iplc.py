@@ -29,6 +29,7 @@ LARGEST = {
     "kfv": 2000.0,
     "kfs": 2000.0,
     "initial": (2000.0, 2000.0),
+    "initial_feed_forward": 1.99,
     "slope_max": 1.0,
 }
 SETS = {"ours": OURS, "paper": PAPER, "largest": LARGEST}
@@ -259,6 +260,22 @@ def test_run_0_is_feedback_and_begins_the_learning_anew(train, inputs_of, run_la
     initial = iplc.learned(gains, train)[0]
     assert (after["learn"][:, 5 : len(initial)] == initial[5:]).all()
     assert (after["learn"][:, 2:5] == after["learn"][:, 2:3]).all()
+
+
+def test_run_0_has_its_share_of_what_reference_and_track_ask_for(train, inputs_of, run_law):
+    cells, speed, position = last_run(200, 6)
+    inputs = inputs_near(inputs_of, speed, position, 7)
+    inputs["iteration"] = 0
+    chance = np.random.default_rng(8)
+    for name in ("ahead_acceleration", "map_acceleration"):
+        inputs[name] = np.round(chance.uniform(-0.8, 0.8, len(inputs)) * 2**27)
+    gains = gains_of(initial=(0.5, 0.05), initial_feed_forward=0.9, m=0, h=0)
+    outputs, _, _ = run_law("iplc", iplc.calibrate(gains, train), inputs, None, cells)
+    expected, _ = in_floating_point(gains, train, cells, inputs)
+    asked = (inputs["ahead_acceleration"] + inputs["map_acceleration"]) / 2**27
+    assert np.corrcoef(expected, asked)[0, 1] > 0.9
+    assert np.abs(outputs["force"] / 2**27 - expected).max() < 2e-6
+    assert np.abs(outputs["force"]).max() == 2**27  # what the train can
 
 
 def test_without_gains_of_its_own_run_0_is_no_force(train, inputs_of, run_law):

@@ -20,6 +20,7 @@ from ato_hil.tools.papers.reference import (
     limited,
     q15,
     q24,
+    q27,
 )
 
 PHI_MIN, PHI_MAX = np.array([0.9, -0.01]), np.array([1.0, 0.01])
@@ -44,6 +45,7 @@ PARAMS = np.dtype(
         ("slope_max", np.float64),  # a tick
         ("feedback", np.float64, (2,)),
         ("initial", np.float64, (2,)),
+        ("initial_feed_forward", np.float64),
         ("gamma", np.float64),
         ("mu", np.float64),
         ("delta", np.float64),
@@ -83,7 +85,7 @@ def _params(gains: iplc.Gains, vehicle: Vehicle) -> np.ndarray:
     params["slope_max"] = gains.slope_max * vehicle.period_s or 2 * vehicle.force_max_m_s2
     params["feedback"] = (gains.kfv, gains.kfs)
     params["initial"] = gains.initial
-    for name in ("gamma", "mu", "delta"):
+    for name in ("initial_feed_forward", "gamma", "mu", "delta"):
         params[name] = getattr(gains, name)
     return params
 
@@ -200,6 +202,8 @@ def _force(p: Any, state: Any, inputs: Any) -> Any:
         own.before[r] = row[INPUT + r]
     if initial:
         wanted = p.initial[0] * e_v + p.initial[1] * e_s
+        asked = q27(inputs.ahead_acceleration) + q27(inputs.map_acceleration)
+        wanted += p.initial_feed_forward * asked
     else:
         later = memory[min(k + p.ahead, len(memory) - 1)]
         own.before[0] = _average(p, own, memory, k)
