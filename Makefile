@@ -11,6 +11,7 @@ MAKEFLAGS += --no-builtin-rules
 PYTHON ?= python3
 SCENARIO ?= subway
 RUNS ?= 10
+TTOBENCH ?=
 PYTEST_ARGS ?=
 GUEST_LIMIT_S ?= 1500
 
@@ -19,7 +20,7 @@ DEV_READY := .venv/dev.ready
 COMPILE := .venv/bin/python -m uv pip compile pyproject.toml --universal --generate-hashes --group build \
 	--no-header --no-annotate --no-emit-index-url --quiet
 
-.PHONY: help hil test long test-socketcan pil verify prove misra firmware-page yizhuang golden pareto figures pictures claims docs lint types lock clean
+.PHONY: help hil test long test-socketcan pil verify prove misra firmware-page yizhuang lines golden pareto figures pictures claims docs lint types lock clean
 
 help: ## list the targets
 	sed -nE 's/^([a-z-]+):[^#]*## (.*)/  make \1\t\2/p' Makefile | expand -t 23
@@ -69,6 +70,9 @@ firmware-page: $(RUN_READY) ## write docs/firmware.md again: flash, RAM, stack, 
 
 yizhuang: $(RUN_READY) ## run the service of docs/yizhuang.md again and write what was measured there
 	.venv/bin/python -m ato_hil.tools.reports.service
+
+lines: $(RUN_READY) ## run every line of docs/lines.md again and write what was measured there: TTOBENCH=FOLDER
+	.venv/bin/python -m ato_hil.tools.reports.lines "$(TTOBENCH)"
 
 golden: $(RUN_READY) ## write new golden digests (tools/verify/golden.json) and say what changed
 	.venv/bin/ato-hil verify --renew-golden $(LAWS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -74,19 +73,16 @@ def import_line(
         last = len(line.stops_m) if to_stop is None else to_stop
         read.check_stops(line, from_stop, last)
         first, last = from_stop - 1, last - 1
-        run_s = None if objective is Objective.time else given[first:last]
-        if run_s is not None and len(run_s) < last - first:
-            free = make.least_times_s(line, vehicle, first + len(run_s), last)
-            run_s += [float(math.ceil(1.1 * least_s)) for least_s in free]
-        if run_s is not None:
-            run_s = read.whole(run_s, make.PERIOD_S)
-        dwells = read.whole(dwells[first : last - 1], make.PERIOD_S)
-        run = make.Run(first, last, run_s, dwells)
+        if objective is Objective.time:
+            run = make.Run(first, last, None, make.whole(dwells[first : last - 1]))
+        else:
+            run = make.timed(line, vehicle, first, last, given, dwells)
         text = make.scenario_text(line, vehicle, run, law, objective.value, source)
         make.check(out, text)
         make.write(out, text)
     length_m = line.stops_m[last] - line.stops_m[first]
-    timed = "in least time" if run_s is None else f"in {sum(run_s) + sum(dwells):g} s"
+    times_s = run.times_s
+    timed = "in least time" if times_s is None else f"in {sum(times_s) + sum(run.dwells_s):g} s"
     say(f"{out}: {length_m:g} m, {last - first + 1} stops, {timed}")
     say(f"next: ato-hil run {out} --mode sil")
     if any(tunnel.from_m < line.stops_m[last] for tunnel in line.tunnels):

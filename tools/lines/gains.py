@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-XI_MAX_M_S2 = 0.12  # what cailc's formats hold
+XI_MAX = (0.12, 3.8e-3, 2.4e-4)  # what cailc's formats hold, for a kilogram
 SPAN_MAX = (120.0, 0.25, 5.8e-4)  # those of drac-robust, N/t and km/h
+DRAG_MIN_M_S2 = 0.01  # a resistance that drac-robust can be uncertain of, at the top speed
 LAWS = ("pid-feedforward", "cailc", "drac-robust", "afilc", "iplc")
 
 
@@ -25,7 +26,7 @@ class Known(NamedTuple):
 def tables(known: Known) -> dict[str, tuple[str, dict[str, Any]]]:
     """The rule and the gains of each law, by name."""
     late, mass, v = known.late_s, known.mass_kg, known.speed_m_s
-    unknown = min(0.02 + (0.1 if known.mapped else 1.2) * known.steepest_m_s2, XI_MAX_M_S2)
+    unknown = min(0.02 + (0.1 if known.mapped else 1.2) * known.steepest_m_s2, XI_MAX[0])
     drag = known.constant_m_s2 + known.linear_1_s * v + known.square_1_m * v * v
     kd = 0.5 / late
     # N/t and km/h, as the paper has them.
@@ -34,12 +35,20 @@ def tables(known: Known) -> dict[str, tuple[str, dict[str, Any]]]:
         known.linear_1_s * 1e3 / 3.6,
         known.square_1_m * 1e3 / 12.96,
     ]
-    whole = [drag * 1e3, drag * 1e3 / (3.6 * v), drag * 1e3 / (3.6 * v) ** 2]
+    likely = max(drag, DRAG_MIN_M_S2) * 1e3
+    whole = [likely, likely / (3.6 * v), likely / (3.6 * v) ** 2]
     span = [max(0.4 * t, 0.2 * w) for t, w in zip(theta, whole, strict=True)]
     # Besides its own, the first coefficient has to cover what no map says of the gradient.
     span[0] += unknown * 1e3
     span = [min(each, most) for each, most in zip(span, SPAN_MAX, strict=True)]
     ticks = round(100 * late)
+    resistance = (known.constant_m_s2, known.linear_1_s, known.square_1_m)
+    wanted = (
+        known.constant_m_s2 + unknown,
+        1.5 * known.linear_1_s + 0.1 * drag / v,
+        1.5 * known.square_1_m + 0.1 * drag / v**2,
+    )
+    xi_max = [min(each, most) for each, most in zip(wanted, XI_MAX, strict=True)]
     return {
         "pid-feedforward": (
             "speed loop kd = 1 / (2 lag), position loop kp = kd^2 / 4 (a double pole),"
@@ -63,15 +72,9 @@ def tables(known: Known) -> dict[str, tuple[str, dict[str, Any]]]:
                 "nu_b": 1.0,
                 "r_max": 0.75,
                 "Xi_min": [-unknown * mass, 0.0, 0.0],
-                "Xi_max": [
-                    min(known.constant_m_s2 + unknown, XI_MAX_M_S2) * mass,
-                    (1.5 * known.linear_1_s + 0.1 * drag / v) * mass,
-                    (1.5 * known.square_1_m + 0.1 * drag / v**2) * mass,
-                ],
+                "Xi_max": [xi * mass for xi in xi_max],
                 "Xi_initial": [
-                    known.constant_m_s2 * mass,
-                    known.linear_1_s * mass,
-                    known.square_1_m * mass,
+                    min(each, most) * mass for each, most in zip(resistance, xi_max, strict=True)
                 ],
             },
         ),
@@ -117,7 +120,7 @@ def tables(known: Known) -> dict[str, tuple[str, dict[str, Any]]]:
         ),
         "iplc": (
             "Q, R: those of `gradient`, which are for a kilogram; m = 0.6 of delay and lag in"
-            " ticks; initial: kd, kp above",
+            " ticks; run 0: kd, kp above, and all of what reference and map ask for",
             {
                 "L": 3,
                 "reading": "B",
@@ -128,6 +131,7 @@ def tables(known: Known) -> dict[str, tuple[str, dict[str, Any]]]:
                 "h": 10,
                 "slope_max": 1.0,
                 "initial": [kd, kd * kd / 4],
+                "initial_feed_forward": 1.0,
             },
         ),
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +34,7 @@ CURVE_PIECE_M = 20.0  # a transition curve in steps
 
 
 FIRST_DWELL_S, LAST_DWELL_S = 5.0, 10.0
+FREE_TIME = 1.1  # what a section without a time takes, of the least
 
 
 class Run(NamedTuple):
@@ -57,7 +59,8 @@ def resistance_steps(line: Line, share: float) -> list[tuple[float, float]]:
         pieces = math.ceil((end - start) / CURVE_PIECE_M) if first != last else 1
         places |= {start + (end - start) * k / pieces for k in range(pieces)}
     steps: list[tuple[float, float]] = []
-    ordered = sorted(places)
+    # Of places within a millimetre the last.
+    ordered = list({round(at, 3): at for at in sorted(places)}.values())
     for at, until in zip(ordered, [*ordered[1:], line.stops_m[-1]], strict=True):
         middle = (at + until) / 2
         slope = [row[1] for row in line.gradients if row[0] <= at][-1:] or [0.0]
@@ -256,14 +259,36 @@ def _braking(line: Line, train: Train) -> list[str]:
 
 
 def least_times_s(line: Line, train: Train, first: int, last: int) -> list[float]:
-    """What each section takes at least, with its margins. Raises PlanError."""
+    """What each section takes at least, with its margins. Raises PlanError, LineError."""
     run = Run(first, last, None, [0.0] * (last - first - 1))
-    text = scenario_text(line, train, run, gains.LAWS[0], "time", "")
-    scenario = msgspec.convert(tomllib.loads(text), Scenario)
+    scenario = _scenario(scenario_text(line, train, run, gains.LAWS[0], "time", ""))
     assert isinstance(scenario.train, point.Train)
     way = road(scenario.track, scenario.atp)
     _table, calls = plan_service(scenario.profile, PERIOD_S, scenario.train, way)
     return [(b.arrival - a.departure) * PERIOD_S for a, b in pairwise(calls)]
+
+
+def timed(
+    line: Line,
+    train: Train,
+    first: int,
+    last: int,
+    times_s: Sequence[float],
+    dwells_s: Sequence[float],
+) -> Run:
+    """The run from stop `first` to `last` by a timetable, in whole control periods: running times
+    from stop to stop as far as they are given, a section without one takes 1.1 times the least;
+    and how long it stands at each stop between. Raises PlanError, LineError."""
+    run_s = list(times_s[first:last])
+    if len(run_s) < last - first:
+        least = least_times_s(line, train, first + len(run_s), last)
+        run_s += [float(math.ceil(FREE_TIME * least_s)) for least_s in least]
+    return Run(first, last, whole(run_s), whole(dwells_s[first : last - 1]))
+
+
+def whole(times_s: Sequence[float]) -> list[float]:
+    """Times as whole control periods."""
+    return [round(round(time_s / PERIOD_S) * PERIOD_S, 6) for time_s in times_s]
 
 
 def _stops(line: Line, run: Run) -> list[str]:
@@ -291,9 +316,16 @@ def _from_start(
 def check(path: Path, text: str) -> None:
     """Raises LineError, in the name of the file to be, if the scenario would be refused."""
     try:
-        planned(msgspec.convert(tomllib.loads(text), Scenario))
-    except (PlanError, msgspec.ValidationError) as error:
+        planned(_scenario(text))
+    except (PlanError, LineError) as error:
         raise LineError(f"{path}: not written: {error}") from None
+
+
+def _scenario(text: str) -> Scenario:
+    try:
+        return msgspec.convert(tomllib.loads(text), Scenario)
+    except msgspec.ValidationError as error:
+        raise LineError(f"the scenario would be refused: {error}") from None
 
 
 def write(path: Path, text: str) -> None:

@@ -70,8 +70,3 @@ def check_stops(line: Line, first: int, last: int) -> None:
             f"--from {first} --to {last}: expected two of the stops 1 to {len(line.stops_m)},"
             " the first below the second"
         )
-
-
-def whole(times: list[float], period_s: float) -> list[float]:
-    """Times as whole control periods."""
-    return [round(round(time / period_s) * period_s, 6) for time in times]

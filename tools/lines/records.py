@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Annotated
 
@@ -10,6 +11,9 @@ import msgspec
 from ato_hil.can_dbc.errors import InputError
 
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e9)]
+Mass = Annotated[float, msgspec.Meta(gt=0, le=5e7)]
+Length = Annotated[float, msgspec.Meta(ge=0, le=1e4)]
+Speed = Annotated[float, msgspec.Meta(ge=1, le=150)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
@@ -36,9 +40,9 @@ class Train(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """A train; also the keys of a train.toml."""
 
     name: str = "train"
-    mass_kg: Positive
+    mass_kg: Mass
     rotating_share: Share = 0.0  # rotating mass, of the mass
-    length_m: NotNegative = 0.0  # 0: not known
+    length_m: Length = 0.0  # 0: not known
     traction_n: Positive
     traction_w: Positive | None = None  # none: no limit
     brake_n: NotNegative = 0.0  # the brake that wins energy back
@@ -46,7 +50,7 @@ class Train(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     friction_brake_n: NotNegative = 0.0
     max_acceleration_m_s2: Positive | None = None
     max_deceleration_m_s2: Positive | None = None
-    max_speed_m_s: Positive
+    max_speed_m_s: Speed
     resistance_n: NotNegative  # r0 + r1 v + r2 v^2
     resistance_n_s_m: NotNegative = 0.0
     resistance_n_s2_m2: NotNegative = 0.0
@@ -77,28 +81,37 @@ class Line(msgspec.Struct, frozen=True, kw_only=True):
     kt_int: float = 1.0
 
 
-def check_stops(where: str, stops: list[float]) -> None:
-    """Raises LineError unless there are two or more, the first at 0, rising."""
+SPEED_MIN_M_S, SPEED_MAX_M_S = 1.0, 150.0  # of a limit
+SLOPE_MAX_PERMILLE = 500.0  # no train that adheres climbs a quarter of it
+RADIUS_MIN_M = 60.0  # Roeckl's formula has its pole at 55 m
+
+
+def check_stops(where: str, stops: list[float], lines: Sequence[int] = ()) -> None:
+    """Raises LineError unless there are two or more, the first at 0, rising. A message names a row,
+    or its line where `lines` has one for each."""
     if len(stops) < 2 or stops[0] != 0.0:
         raise LineError(f"{where}: expected two or more positions, the first 0")
-    check_rising(where, stops)
+    check_rising(where, stops, lines)
 
 
-def check_steps(where: str, positions: list[float], length_m: float) -> None:
-    """Raises LineError unless the positions begin at 0, rise and stay below the length."""
+def check_steps(
+    where: str, positions: list[float], length_m: float, lines: Sequence[int] = ()
+) -> None:
+    """Raises LineError unless the positions begin at 0, rise and stay below the length; `lines` as
+    in `check_stops`."""
     if not positions or positions[0] != 0.0:
         raise LineError(f"{where}: expected one or more rows, the first at position 0")
-    check_rising(where, positions)
+    check_rising(where, positions, lines)
     if positions[-1] >= length_m:
         raise LineError(
             f"{where}: position {positions[-1]:g} m, expected less than the length, {length_m:g} m"
         )
 
 
-def check_rising(where: str, positions: list[float]) -> None:
-    """Raises LineError at the first position that is not above the one before it."""
-    for row, (before, after) in enumerate(pairwise(positions), 2):
+def check_rising(where: str, positions: list[float], lines: Sequence[int] = ()) -> None:
+    """Raises LineError at the first position that is not above the one before it; `lines` as in
+    `check_stops`."""
+    for row, (before, after) in enumerate(pairwise(positions), 1):
         if not after > before:
-            raise LineError(
-                f"{where}: row {row}: position {after:g} m, expected above {before:g} m"
-            )
+            place = f"line {lines[row]}" if lines else f"row {row + 1}"
+            raise LineError(f"{where}: {place}: position {after:g} m, expected above {before:g} m")

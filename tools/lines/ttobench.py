@@ -14,6 +14,10 @@ from typing import Any
 import msgspec
 
 from ato_hil.tools.lines.records import (
+    RADIUS_MIN_M,
+    SLOPE_MAX_PERMILLE,
+    SPEED_MAX_M_S,
+    SPEED_MIN_M_S,
     Braking,
     Line,
     LineError,
@@ -126,18 +130,28 @@ def read_line(path: Path) -> Line:
 
     limits = rows("speed limits", {"position": LENGTH, "velocity": SPEED})
     for number, row in enumerate(limits, 1):
-        if not row[1] > 0:
-            raise LineError(f"{path}: field 'speed limits': row {number}: expected a speed above 0")
+        if not SPEED_MIN_M_S <= row[1] <= SPEED_MAX_M_S:
+            raise LineError(
+                f"{path}: field 'speed limits': row {number}: {row[1]:g} m/s,"
+                f" expected {SPEED_MIN_M_S:g} to {SPEED_MAX_M_S:g}"
+            )
     gradients, curves, tunnels = [], [], []
     if "gradients" in content:
         gradients = rows("gradients", {"position": LENGTH, "slope": SLOPE})
+        for number, row in enumerate(gradients, 1):
+            if abs(row[1]) > SLOPE_MAX_PERMILLE:
+                raise LineError(
+                    f"{path}: field 'gradients': row {number}: {row[1]:g} per mille,"
+                    f" expected up to {SLOPE_MAX_PERMILLE:g} either way"
+                )
     if "curvatures" in content:
         radii = {"position": LENGTH, "radius at start": LENGTH, "radius at end": LENGTH}
         curves = rows("curvatures", radii)
         for number, row in enumerate(curves, 1):
-            if 0.0 in row[1:]:
+            if min(map(abs, row[1:])) < RADIUS_MIN_M:
                 raise LineError(
-                    f"{path}: field 'curvatures': row {number}: expected no radius of 0"
+                    f"{path}: field 'curvatures': row {number}:"
+                    f" expected radii of {RADIUS_MIN_M:g} m and more"
                 )
     if "tunnels" in content:
         columns = {"position": LENGTH, "length": LENGTH, "cross section": AREA}

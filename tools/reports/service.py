@@ -128,9 +128,10 @@ def measured(loaded: Loaded, law: str, rows: Sequence[dict[str, Any]], digest: s
     )
 
 
-def with_measured(page: str, text: str) -> str:
-    """A page with what is between its marks replaced. Raises ValueError for one without marks."""
-    before, begin, rest = page.partition(BEGIN)
+def with_measured(page: str, text: str, mark: str = BEGIN) -> str:
+    """A page with what is between `mark` and END replaced. Raises ValueError for one without
+    them."""
+    before, begin, rest = page.partition(mark)
     _old, end, after = rest.partition(END)
     if not begin or not end:
         raise ValueError("the page has no marks for what was measured")
