@@ -318,7 +318,7 @@ class Fmu:
             slave.setBinary([bus["Rx_Data"]], [operations])
         for _ in range(ITERATIONS_MAX):
             if slave.getClock([bus["Tx_Clock"]])[0]:
-                sent += bytes(slave.getBinary([bus["Tx_Data"]])[0])
+                sent += slave.getBinary([bus["Tx_Data"]])[0] or b""  # None: no bytes
             if not slave.updateDiscreteStates()[0]:
                 return sent
         raise FmuError(f"an event does not end within {ITERATIONS_MAX} rounds")

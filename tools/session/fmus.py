@@ -58,12 +58,12 @@ class BusNode:
 
     def begin(self) -> list[Frame]:
         """What it sends before the first control period."""
-        return frames_of(self.fmu.event(b""))
+        return frames_of(self.fmu.event(b""), self.fmu.file)
 
     def exchange(self, frames: list[Frame]) -> list[Frame]:
         """Frames come in an event, then a control period passes."""
         at_once, later, self.outputs = self.fmu.turn(b"".join(map(transmit, frames)))
-        return frames_of(at_once) + frames_of(later)
+        return frames_of(at_once, self.fmu.file) + frames_of(later, self.fmu.file)
 
 
 class SignalNode:
@@ -138,13 +138,16 @@ def transmit(frame: Frame) -> bytes:
     return TRANSMIT_HEAD.pack(TRANSMIT, length, frame[0], 0, 0, len(data)) + data
 
 
-def frames_of(operations: bytes) -> list[Frame]:
-    """The frames of ours among operations. Raises FmuError for what is none."""
+def frames_of(operations: bytes, file: str) -> list[Frame]:
+    """The frames of ours among operations of an FMU. Raises FmuError for what is none."""
     frames, at = [], 0
     while at < len(operations):
         code, length = OPERATION.unpack_from(operations.ljust(at + 8, b"\0"), at)
         if length < OPERATION.size or at + length > len(operations):
-            raise FmuError(f"an operation of {length} bytes on the bus, where it has fewer")
+            raise FmuError(
+                f"{file}: an operation of {length} bytes for the bus, expected at least"
+                f" {OPERATION.size} and no more than there are: {len(operations) - at}"
+            )
         if code == TRANSMIT and length >= TRANSMIT_HEAD.size:
             head = TRANSMIT_HEAD.unpack_from(operations, at)
             data = operations[at + TRANSMIT_HEAD.size : at + length]

@@ -8,7 +8,7 @@ import pytest
 from ato_hil.plant_sim.fmi.process import FmuError
 from ato_hil.plant_sim.scenario import ScenarioError, load, overlaid
 from ato_hil.tools.export.fmu import archive, controller, plant
-from ato_hil.tools.session import session
+from ato_hil.tools.session import fmus, session
 from ato_hil.tools.session.options import Options, SessionError
 from ato_hil.tools.session.processes import RunError
 
@@ -87,6 +87,16 @@ def test_a_line_has_an_fmu_for_each_train(tmp_path, made):
     archive.write(controller.unpacked(load(str(file)), None), tmp_path / "ato.fmu")
     summary = made(scenario=file, controller_fmu=tmp_path / "ato.fmu")
     assert summary["digest"] == made("sil", scenario=file)["digest"]
+
+
+@pytest.mark.parametrize("operation", [b"\x10\0\0\0\x07\0\0\0", b"\x10\0\0\0\x18\0\0\0 ", b"\x10"])
+def test_what_is_no_operation_names_the_fmu(operation):
+    whole = fmus.transmit((0x90, 5))
+    assert fmus.frames_of(whole + whole, "odd.fmu") == [(0x90, 5)] * 2
+    with pytest.raises(
+        FmuError, match=r"^odd\.fmu: an operation of \d+ bytes for the bus, expected"
+    ):
+        fmus.frames_of(whole + operation, "odd.fmu")
 
 
 def test_another_scenario_is_refused(place, made):

@@ -120,7 +120,7 @@ def test_the_toolbox_connects_them_directly(toolbox, nodes, loaded, expected):
         duration_s(loaded),
     )
     exchanges = [
-        (name == "train", fmus.frames_of(bytes.fromhex(row[f"{name}.CanChannel.Tx_Data"])))
+        (name == "train", fmus.frames_of(bytes.fromhex(row[f"{name}.CanChannel.Tx_Data"]), name))
         for row in rows
         for name in ("train", "ato")
         if row[f"{name}.CanChannel.Tx_Clock"] == "1"
@@ -223,6 +223,6 @@ def test_they_meet_on_a_bus_simulation(nodes, loaded, expected, opened, notifica
     bus = Connected(opened(BUS), list(zip(both, ("Node1", "Node2"), strict=True)))
     for number in range(1, round(duration_s(loaded) / PERIOD_S)):
         bus.period(number)
-    exchanges = [(to == "Node1", fmus.frames_of(content)) for to, content in bus.handed_on]
+    exchanges = [(to == "Node1", fmus.frames_of(content, to)) for to, content in bus.handed_on]
     assert digest_of(exchanges) == expected
     assert all(node["CanChannel.TransmitErrors"] == 0 for node in both)
