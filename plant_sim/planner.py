@@ -222,9 +222,12 @@ def limit_at(
     units = units_of(period_s)
     until = [whole_ticks(limit.until_s, "until_s of a limit", units) for limit in limits]
     if any(later <= earlier for earlier, later in itertools.pairwise(until)):
-        raise PlanError("the until_s of the limits do not increase")
+        raise PlanError("limits: expected until_s to rise")
     if not until or until[-1] < ticks.max():
-        raise PlanError(f"the limits end before {ticks.max() * period_s:g} s")
+        raise PlanError(
+            f"limits: the last until_s is {until[-1] * period_s if until else 0:g}, expected"
+            f" {ticks.max() * period_s:g} or more, the end of the run"
+        )
     speeds_m_s = np.array([limit.speed_m_s for limit in limits])
     return speeds_m_s[np.searchsorted(until, ticks)]
 

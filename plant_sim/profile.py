@@ -151,14 +151,16 @@ def unit_factors(period_s: float) -> tuple[int, int]:
     Raises ValueError if they are not integers: 10, 20, 50 and 100 ms are possible, 30 ms is not.
     """
     if not 0 < period_s <= 1:
-        raise ValueError(f"control period {period_s} s is not above 0 and at most 1 s")
+        raise ValueError(f"period_s is {period_s:g}, expected more than 0, at most 1")
     speed_factor = round(3 / period_s)
     acceleration_factor = round(6 / (period_s * period_s))
     if not (
         math.isclose(speed_factor * period_s, 3, rel_tol=1e-12)
         and math.isclose(acceleration_factor * period_s * period_s, 6, rel_tol=1e-12)
     ):
-        raise ValueError(f"control period {period_s} s does not make 3/T and 6/T^2 integers")
+        raise ValueError(
+            f"period_s is {period_s:g}, expected T with 3/T and 6/T^2 whole numbers, as 0.01"
+        )
     return speed_factor, acceleration_factor
 
 

@@ -500,10 +500,10 @@ def test_limits_hold_to_the_end_of_their_interval():
 @pytest.mark.parametrize(
     ("until_s", "message"),
     [
-        ([30.0, 25.0], "the until_s of the limits do not increase"),
-        ([25.0, 29.0], "the limits end before 30 s"),
+        ([30.0, 25.0], "limits: expected until_s to rise"),
+        ([25.0, 29.0], "limits: the last until_s is 29, expected 30 or more, the end of the run"),
         ([25.005, 30.0], "until_s of a limit = 25.005 is not a multiple of the period 0.01 s"),
-        ([], "the limits end before 30 s"),
+        ([], "limits: the last until_s is 0, expected 30 or more, the end of the run"),
     ],
 )
 def test_limits_must_cover_the_run_in_order(until_s, message):
@@ -573,7 +573,7 @@ def test_the_small_plan_is_sound():
             "margin_m_s = 0.3",
             r"9.9\d* m/s at .* s is above the limit of 10.2 m/s",
         ),
-        ("until_s = 100.0", "until_s = 99.0", "the limits end before 100 s"),
+        ("until_s = 100.0", "until_s = 99.0", "limits: the last until_s is 99, expected 100"),
     ],
 )
 def test_a_plan_that_cannot_be_met_is_one_clear_line(old, new, message):

@@ -119,7 +119,7 @@ def test_a_value_that_only_rounding_lifts_out_of_range_is_refused():
 
 @pytest.mark.parametrize("period_s", [0.03, 0.007, 0.15, 0.0, -0.01, 2.0, float("nan")])
 def test_a_period_without_whole_units_is_refused(period_s):
-    with pytest.raises(ValueError, match=r"^control period"):
+    with pytest.raises(ValueError, match=r"^period_s is"):
         evaluate(table((10, 0)), period_s)
 
 

@@ -66,7 +66,7 @@ def compare(
                 rows += ended.rows
                 for train, frames in enumerate(ended.frames):
                     writer.frames(number, frames, train)
-                facts.apply(replace(ended.told, run=number), writer)
+                facts.apply(replace(ended.told, run=number, row=ended.rows[-1]), writer)
     finally:
         writer.close()
     return rows

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import resource
+import shutil
 import sys
 from collections.abc import Callable
 from typing import Annotated
@@ -27,10 +28,13 @@ from ato_hil.tools.cli.options import Viewer
 from ato_hil.tools.cli.output import ignore_other_tools, streams
 from ato_hil.tools.runs.limits import limit
 
+NARROW = 80  # columns, below which a table of options would cut their names
+
 app = typer.Typer(
     name="ato-hil",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode="rich" if shutil.get_terminal_size().columns >= NARROW else None,
 )
 
 COMMANDS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {

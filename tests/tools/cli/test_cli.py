@@ -83,6 +83,14 @@ def test_the_version_is_that_of_the_package(ato_hil, tmp_path: Path) -> None:
     assert done.stdout == f"ato-hil {importlib.metadata.version('ato-hil')}\n"
 
 
+@pytest.mark.parametrize("width", [40, 80])
+def test_help_cuts_no_option(ato_hil, tmp_path: Path, width: int) -> None:
+    done = ato_hil("run", "--help", cwd=tmp_path, COLUMNS=str(width))
+    assert done.returncode == 0, done.stderr
+    assert "…" not in done.stdout
+    assert {"--overwrite", "--controller-fmu", "--spin-us"} <= set(done.stdout.split())
+
+
 def test_help_shows_the_commands_in_their_groups() -> None:
     text = CliRunner().invoke(main.app, ["--help"]).output
     at = [text.index(f" {panel} ") for panel in main.COMMANDS]
@@ -132,6 +140,7 @@ def test_compare_lays_laws_side_by_side(ato_hil, short_text, tmp_path: Path) -> 
     }
     assert "/truth/position_error_m/cailc" in entities
     assert "/truth/position_error_m/pid" in entities
+    assert {"/runs/table", "/runs/bars/max_position_error_m"} <= entities
 
 
 @pytest.mark.parametrize(
