@@ -480,10 +480,7 @@ def assembled(
     name: str, path: Path, case: str, cases: tuple[str, ...], digest: str, scenario: Scenario
 ) -> Loaded:
     """A validated scenario, planned. Raises PlanError, ValueError."""
-    segments, calls = _planned(scenario)
-    profile = evaluate(segments, scenario.period_s)
-    if calls:
-        profile = displaced(profile, calls[0].position_m)
+    segments, profile, calls = _reference(scenario)
     return Loaded(
         name, path, case, cases, digest, scenario, segments, profile,
         calls=calls, part=part_of(name),
@@ -492,19 +489,29 @@ def assembled(
 
 def planned(scenario: Scenario) -> np.ndarray:
     """The reference's table, as the plan states it or as its objective asks."""
-    return _planned(scenario)[0]
+    return _reference(scenario)[0]
 
 
-def _planned(scenario: Scenario) -> tuple[np.ndarray, tuple[service.Call, ...]]:
-    """The reference's table, and the stops of a service."""
+def _reference(scenario: Scenario) -> tuple[np.ndarray, Profile, tuple[service.Call, ...]]:
+    """The reference's table, the table at every tick, and the stops of a service."""
     plan, period_s = scenario.profile, scenario.period_s
     if plan.objective is None:
-        return plan_profile(plan, period_s), ()
+        return *_ramps(plan, period_s), ()
     assert isinstance(scenario.train, point.Train)
     line = road(scenario.track, scenario.atp)
-    if plan.stops:
-        return service.plan_service(plan, period_s, scenario.train, line)
-    return plan_running(plan, period_s, scenario.train, line), ()
+    if not plan.stops:
+        segments = plan_running(plan, period_s, scenario.train, line)
+        return segments, evaluate(segments, period_s), ()
+    segments, calls = service.plan_service(plan, period_s, scenario.train, line)
+    return segments, displaced(evaluate(segments, period_s), calls[0].position_m), calls
+
+
+@lru_cache(maxsize=16)
+def _ramps(plan: ProfilePlan, period_s: float) -> tuple[np.ndarray, Profile]:
+    """A plan that depends on nothing else, once for all scenarios that have it: to place its ramps
+    takes longer than a run."""
+    segments = plan_profile(plan, period_s)
+    return segments, evaluate(segments, period_s)
 
 
 def _in_part(place: str, content: dict[str, Any], part: str) -> dict[str, Any]:

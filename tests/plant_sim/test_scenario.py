@@ -413,3 +413,14 @@ def test_an_overlay_is_what_a_file_would_state():
     assert loaded.scenario.laws["iplc"] == load("gradient:VII").scenario.laws["iplc"]
     assert loaded.scenario.runs == 2
     assert load("gradient:VI").scenario.laws["iplc"]["S"] == 0.0
+
+
+def test_scenarios_with_one_plan_share_it_and_others_do_not():
+    one = overlaid("subway", {"control": {"mass_error": 0.01}})
+    other = overlaid("subway", {"control": {"mass_error": 0.02}})
+    assert one.segments is other.segments
+    assert one.profile is other.profile
+    shorter = overlaid("subway", {"profile": {"distance_m": 3500.0}})
+    assert shorter.profile.position_m[-1] < one.profile.position_m[-1]
+    finer = overlaid("subway", {"period_s": 0.005})
+    assert len(finer.profile.x) > len(one.profile.x)
