@@ -101,8 +101,7 @@ def calibrate(
 ) -> Calibration:
     """PARAMS of the firmware for one law on one scenario; `start_m` is where the timetable starts,
     with `atp_releases` ATP's emergency brake ends at the permitted speed, with `yielding_settings`
-    the timetable yields to what it permits. Raises CalibrationError
-    or LawError with one line."""
+    the timetable yields to what it permits. Raises CalibrationError or LawError with one line."""
     known = load_law(law)
     params = np.zeros(1, firmware.params_dtype(known.PARAMS))
     params["core"] = firmware.calibrate_core(

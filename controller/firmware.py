@@ -557,7 +557,8 @@ def after_law(params: Record, profile: Array, state: Record, cells: Array, tx: A
     """All that a tick does with what the law left in `state.outputs` and `state.cell`: learning
     memory, guard, distribution over the cars, frames; then the reference goes on by a tick."""
     core = state.core
-    memory.scatter(params.memory, state.memory, cells, state.cell)
+    if int64(core.waits) == 0:
+        memory.scatter(params.memory, state.memory, cells, state.cell)
     command(params, state)
     send(params, state, tx)
     if int64(params.yielding.enabled) != 0:

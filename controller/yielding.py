@@ -1,17 +1,19 @@
 """Yielding: where ATP permits less than the timetable asks for, the timetable goes slower.
 
 The reference p(s) of the timetable is gone through at a pace of its own, s' = r, 0 <= r <= 1, so
-that its speed r p' keeps below what is permitted, here and, braked to in time, at ATP's target.
-Each stop stays where it is, and is reached later: by as much as s has fallen behind the time.
-Nothing is planned anew, and nothing made up for. With u the speed allowed, over a time of 1 s:
+that its speed v_r = r p' keeps below what is permitted, here and, braked to in time, at ATP's
+target. Each stop stays where it is, and is reached later: by as much as s has fallen behind the
+time. Nothing is planned anew, and nothing made up for. With u the speed allowed and j the jerk:
 
     u   = min(v_permitted, sqrt(v_target^2 + 2 (3/4 b) (d - v_r 1 s))) - margin
     u   = min(u, v + (2 m + x - x_r) / 1 s)            it does not leave a train behind
-    a_r = min(r^2 p'' + (1 - r) p' / 1 s, max(a_up, r^2 p''), max((u - v_r) / 1 s, -b))
-    r'  = (a_r - r^2 p'') / p'                         a_r by steps of jerk Ts
+    a_u = sqrt(2 j (u - v_r)), or, above u, (u - v_r) / 1 s, not below -b
+    a_r = min(r^2 p'' + (1 - r) p' / 1 s, max(a_up, r^2 p''), a_u)     by steps of j Ts
+    r'  = (a_r - r^2 p'') / p'
 
-While r = 1 and the last of the three is not the least, nothing is changed, to the bit. At a stop,
-below 0.05 m/s, the pace is 1 again.
+While r = 1 and a_u is not the least, nothing is changed, to the bit. At a stop, below 0.05 m/s, the
+pace is 1 again. Below 15/16 the train has left its timetable: FAULT_REBASED, nothing is learned.
+The learning memory goes by s, not by the time, so what was learned stays where it belongs.
 
 Contract: `follow` is a step of bounded time.
 """

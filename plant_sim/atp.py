@@ -103,7 +103,7 @@ UnderReading = Annotated[float, msgspec.Meta(ge=0, le=0.2)]
 BuildUpFactor = Annotated[float, msgspec.Meta(ge=1, le=5)]
 Ticks = Annotated[int, msgspec.Meta(ge=1, le=10_000)]
 TimeOfRun = Annotated[float, msgspec.Meta(ge=0, le=1e5)]
-Run = Annotated[int, msgspec.Meta(ge=1, le=4095)]
+Run = Annotated[int, msgspec.Meta(ge=1, le=4095)]  # as RUN_CTRL carries
 
 
 class StaticSpeed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -12,6 +12,7 @@ from ato_hil.tools.lines import plans
 from ato_hil.tools.runs import folder, onboard
 from ato_hil.tools.runs.frames import decode
 from ato_hil.tools.runs.stops import stop_rows
+from ato_hil.tools.session import sil
 
 SERVICE = """
 title = "Four stops"
@@ -266,7 +267,9 @@ def test_a_late_run_over_the_bus_has_the_digest_of_sil(file, tmp_path):
     assert len(digests) == 1
 
 
-def test_a_run_that_is_late_is_not_learned_from(file):
+@pytest.fixture
+def learning(file):
+    """The same with a law that learns: only run 2 is late."""
     name = lowered(file, "from_run = 2\nto_run = 2")
     path = file.parent / "changed.toml"
     gains = load("yizhuang").scenario.laws["cailc"]
@@ -274,10 +277,28 @@ def test_a_run_that_is_late_is_not_learned_from(file):
     memory = "[control.memory]\ndecimation = 16\nlead_ticks = 25\n"
     path.write_text(f"{path.read_text()}\n{memory}\n[laws.cailc]\n{rows}\n")
     load.cache_clear()
-    first, second, third = ato_hil.simulate(name, law="cailc", runs=3)
+    return name
+
+
+def test_a_run_that_is_late_is_not_learned_from(learning):
+    first, second, third = ato_hil.simulate(learning, law="cailc", runs=3)
     assert [run.row["faults"] for run in (first, third)] == [[], []]
     assert second.row["faults"] == ["timetable re-based"]
     assert third.row["rms_position_error_m"] < first.row["rms_position_error_m"]
+
+
+def test_what_was_learned_stays_where_the_timetable_has_it(learning):
+    loaded = load(learning)
+    (node,) = onboard.controllers_for([loaded], "cailc")
+    cells = []
+    for _run in sil.run_line(loaded, [node], runs=range(1, 3), seed=1):
+        cursor, state = node.state[0]["cursor"], node.state[0]["memory"]
+        ticks = loaded.segments["ticks"]
+        passed = int(ticks[: int(cursor["segment"]) + 1].sum()) - int(cursor["left"])
+        assert abs(int(state["write_cell"]) - (passed - 25) / 16) < 2
+        assert abs(int(state["read_cell"]) - passed / 16) < 2
+        cells.append(int(state["write_cell"]))
+    assert cells[0] - cells[1] > 1400 / 16  # run 2 was so late
 
 
 @pytest.mark.parametrize(
