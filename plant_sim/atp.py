@@ -90,6 +90,7 @@ CURVES = 6
 
 KM_H = 1 / 3.6
 STANDSTILL_M_S = 0.01
+ANNOUNCED_M_S2 = 0.5  # deceleration by which `margin` compares targets: of a train in service
 
 Place = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 Length = Annotated[float, msgspec.Meta(ge=0, le=1e4)]
@@ -410,18 +411,22 @@ def is_inside(first: Any, last: Any, tick: Any) -> Any:
 
 @step
 def announce(limits: Any, state: Any, tick: Any, position_m: Any) -> None:
-    """The next temporary speed is the target: `margin` has no curves that lead to it."""
+    """The temporary speed ahead that asks for the least speed now is the target: `margin` has no
+    curves that lead to it."""
+    least = np.inf
     for number in range(len(limits.temporary)):
         lower = limits.temporary[number]
         ahead_m = lower.from_m - position_m
         if (
             is_inside(lower.from_tick, lower.until_tick, tick)
             and ahead_m > 0.0
-            and ahead_m < state.target_distance_m
             and lower.speed_m_s < state.curve_m_s[PERMITTED]
         ):
-            state.target_speed_m_s = lower.speed_m_s
-            state.target_distance_m = ahead_m
+            square = lower.speed_m_s * lower.speed_m_s + 2.0 * ANNOUNCED_M_S2 * ahead_m
+            if square < least:
+                least = square
+                state.target_speed_m_s = lower.speed_m_s
+                state.target_distance_m = ahead_m
 
 
 @step

@@ -699,6 +699,20 @@ def test_a_temporary_speed_is_announced():
         assert (state["target_speed_m_s"], state["target_distance_m"]) == target
 
 
+def test_of_two_temporary_speeds_the_one_that_asks_for_less_is_announced():
+    places = ((1000.0, 19.0), (1040.0, 9.0), (1900.0, 2.0))
+    known = atp.Atp(
+        supervision="margin",
+        temporary=[
+            atp.TemporarySpeed(from_m=at, to_m=2000.0, speed_m_s=speed) for at, speed in places
+        ],
+    )
+    supervised = Supervisor(known, limits_for(known, limit=20.0))
+    for place, target in ((500.0, 1040.0), (1039.0, 1040.0), (1041.0, 1900.0)):
+        supervised.at(place)
+        assert supervised.state[0]["target_distance_m"] == target - place
+
+
 def test_a_temporary_speed_is_braked_to_as_a_static_one():
     static = atp.Atp(
         supervision="etcs",
