@@ -62,6 +62,15 @@ def test_least_energy_without_resistance_is_the_kinetic_energy_of_the_closed_for
     assert profile.speed_m_s.max() == pytest.approx(v, rel=0.01)
 
 
+def test_a_slow_train_has_time():
+    """Its energies are so small that a second hardly counts; it was told that it had too little."""
+    slow = {"distance_m": 100.0, "max_speed_m_s": 1.0, "force_share": 0.9, "margin_m_s": 0.3}
+    segments, profile = table(plan(**slow, duration_s=310.0), train(constant=0.015))
+    assert segments["ticks"].sum() * PERIOD_S == pytest.approx(310.0)
+    # Pushed and rolling, it is hardly faster than on average.
+    assert 100 / 310 < profile.speed_m_s.max() < 2 * 100 / 310
+
+
 def test_braking_work_that_comes_back_makes_the_train_faster_and_the_net_work_less():
     heavy = train(constant=0.02, square=1e-4)
     way = {"distance_m": 3000.0, "duration_s": 200.0}
