@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ato_hil.tools.trace.colours import RAMP, Colour, ramp
+from ato_hil.tools.trace.colours import Colour, ramp
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -98,8 +98,8 @@ def memory_map(
             [(-0.03 * length_m, height * (row + 0.5) / runs) for row in rows],
             [f"run {numbers[row]}" for row in rows],
         ),
-        "low": _labels([(0.25 * length_m, -0.16 * height)], [f"lowest {low:.4g}"], RAMP[0]),
-        "high": _labels([(0.75 * length_m, -0.16 * height)], [f"highest {high:.4g}"], RAMP[-1]),
+        "low": _labels([(0.25 * length_m, -0.16 * height)], [f"violet: lowest {low:.4g}"]),
+        "high": _labels([(0.75 * length_m, -0.16 * height)], [f"yellow: highest {high:.4g}"]),
     }
 
 
@@ -141,11 +141,9 @@ def _pieces(line: Curve) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(line.x[piece], line.y[piece]) for piece in few]
 
 
-def _labels(
-    places: list[tuple[float, float]], texts: list[str], colour: Colour = INK
-) -> rr.Points2D:
+def _labels(places: list[tuple[float, float]], texts: list[str]) -> rr.Points2D:
     import rerun as rr
 
     return rr.Points2D(
-        places, labels=texts, colors=[colour], radii=rr.Radius.ui_points(0.1), show_labels=True
+        places, labels=texts, colors=[INK], radii=rr.Radius.ui_points(0.1), show_labels=True
     )

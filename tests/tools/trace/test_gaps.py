@@ -6,7 +6,7 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 from ato_hil.tools.trace.blueprints import CURVES
-from ato_hil.tools.trace.charts import POINTS_MAX, Curve, curves
+from ato_hil.tools.trace.charts import INK, POINTS_MAX, Curve, curves, memory_map
 from ato_hil.tools.trace.plots import SUPERVISION
 from ato_hil.tools.trace.writer import TraceWriter
 
@@ -25,6 +25,14 @@ def test_a_long_line_keeps_its_ends():
     (strip,) = drawing["limit"].strips.as_arrow_array().to_pylist()
     assert (strip[0][0], strip[-1][0]) == (0, x[-1])
     assert len(strip) <= POINTS_MAX + 2
+
+
+def test_the_labels_of_a_map_are_readable_in_both_themes():
+    drawing = memory_map(np.array([[0.0, 1.0], [2.0, 3.0]]), 100.0, [1, 2])
+    ink = int.from_bytes((*INK, 255))
+    for name, text in (("low", "violet: lowest 0"), ("high", "yellow: highest 3")):
+        assert drawing[name].labels.as_arrow_array().to_pylist() == [text]
+        assert drawing[name].colors.as_arrow_array().to_pylist() == [ink]
 
 
 def test_every_curve_of_atp_has_its_colour_in_the_title():
