@@ -22,20 +22,21 @@ def clean(
 
     with one_line_for_bad_input():
         compiled = cache.root()  # of ours alone, also where NUMBA_CACHE_DIR names the place
-        if compiled is not None and any(compiled.iterdir()):
-            _remove(compiled)
-        folders = sorted(places.RUNS.iterdir()) if runs and places.RUNS.is_dir() else []
-        for folder in folders:
+        folders = [compiled] if compiled is not None and any(compiled.iterdir()) else []
+        for folder in sorted(places.RUNS.iterdir()) if runs and places.RUNS.is_dir() else []:
             if folder.is_dir() and any((folder / name).exists() for name in places.RESULTS):
-                _remove(folder)
+                folders.append(folder)
+        left = [why for folder in folders if (why := _remove(folder))]
+        if left:
+            raise places.PlaceError("; ".join(left))
 
 
-def _remove(folder: Path) -> None:
-    if not folder.is_dir():
-        return
+def _remove(folder: Path) -> str:
+    """Removes a folder, and says so; returns why it could not, as another program writes there."""
     size = sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())
     try:
         shutil.rmtree(folder)
     except OSError as error:
-        raise places.PlaceError(f"{error.filename}: cannot be removed: {error.strerror}") from None
+        return f"{folder}: cannot be removed: {error.strerror}"
     say(f"removed {folder}   {size / 1e6:.1f} MB")
+    return ""

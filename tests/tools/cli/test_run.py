@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import shutil
 from pathlib import Path
 
 import pytest
+import typer
 from rich.console import Console
 
-from ato_hil.can_dbc import step
+from ato_hil.can_dbc import cache, step
 from ato_hil.plant_sim.scenario import load
-from ato_hil.tools.cli import console, run
+from ato_hil.tools.cli import clean, console, run
 from ato_hil.tools.cli.options import Mode, Pace
 from ato_hil.tools.runs import columns, expect
 from ato_hil.tools.runs.expect import ExpectError, parse, unmet
@@ -117,6 +120,30 @@ def test_clean_takes_what_can_be_made_again(ato_hil, tmp_path: Path) -> None:
     assert (cache / "others").exists()
     done = ato_hil("clean", cwd=tmp_path, NUMBA_CACHE_DIR=str(cache))
     assert (cache / "others").exists()
+
+
+def test_clean_names_what_it_cannot_remove_and_goes_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("busy", "free"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "summary.json").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cache, "root", lambda: None)
+    remove = shutil.rmtree
+
+    def another_writes_there(folder: Path) -> None:
+        if folder.name == "busy":
+            raise OSError(errno.ENOTEMPTY, "Directory not empty", "ce8dec")  # by rmtree: no path
+        remove(folder)
+
+    monkeypatch.setattr(shutil, "rmtree", another_writes_there)
+    with pytest.raises(typer.Exit) as caught:
+        clean.clean(runs=True)
+    assert caught.value.exit_code == 1
+    why = "ato-hil: runs/busy: cannot be removed: Directory not empty\n"
+    assert capsys.readouterr().err == why
+    assert not (tmp_path / "runs" / "free").exists()
 
 
 def test_what_takes_minutes_says_so_first(screen: io.StringIO) -> None:
