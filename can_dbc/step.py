@@ -258,12 +258,13 @@ def _uncompiled(function: Any) -> Any:
 
 
 _PLACE = re.compile(r" at (/.+?\.py) \((\d+)\)")
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")  # that numba gives its messages where colorama is there
 
 
 def refusal(error: Exception) -> str:
     """One line for what the compiler says of a step that it refuses (a NumbaError): file and line
     where the fault is, innermost and outside these packages if there is such a place, and why."""
-    text = str(error)
+    text = _COLOUR.sub("", str(error))
     root = str(Path(__file__).resolve().parent.parent)
     places = _PLACE.findall(text)
     outside = [(file, line) for file, line in places if not file.startswith(f"{root}{os.sep}")]

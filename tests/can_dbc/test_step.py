@@ -370,3 +370,10 @@ def test_what_the_compiler_refuses_is_one_line_with_its_place(body, line, reason
     assert said.startswith(f"{file}:{line}: the compiler refuses it: ")
     assert reason in said
     assert "\n" not in said
+
+
+def test_what_the_compiler_refuses_is_said_without_its_colours():
+    coloured = (
+        "\x1b[1mFailed in nopython mode pipeline\x1b[0m\n\x1b[1m\x1b[31mno such thing\x1b[0m\n"
+    )
+    assert step_module.refusal(NumbaError(coloured)) == "the compiler refuses it: no such thing"

@@ -34,8 +34,7 @@ def test_the_messages_of_a_tick_are_those_of_the_run():
     assert bytes(first.there[1].data) == (-2).to_bytes(8, "little", signed=True)
 
 
-def test_it_plays_on_the_hub_and_holds_its_place(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def test_it_plays_on_the_hub_and_holds_its_place(runtime_dir):
     assert echo.rate("hub:echo", ROWS) > 0
     name = choose_bus("hub:echo").name
     with (
