@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import tomllib
 from collections.abc import Iterable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +19,17 @@ def read_toml(path: Path) -> dict[str, Any]:
     """The tables of a TOML file, with or without a byte-order mark. Raises ValueError with what is
     wrong with the file."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return copy.deepcopy(_parsed(path.read_text(encoding="utf-8-sig")))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"not valid TOML: {error}") from None
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror}") from None
+
+
+@lru_cache(maxsize=64)
+def _parsed(text: str) -> dict[str, Any]:
+    """A campaign reads the same files for each of its sessions; to parse one takes some ms."""
+    return tomllib.loads(text)
 
 
 def strange_number(content: Any, key: str = "") -> Trouble | None:

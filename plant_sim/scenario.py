@@ -419,9 +419,9 @@ def _cases(path: Path, content: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return cases
 
 
-@lru_cache(maxsize=64)
 def load(name: str) -> Loaded:
-    """A scenario by name or path, or a case of one, validated and planned.
+    """A scenario by name or path, or a case of one, validated and planned: once for as long as its
+    files say the same.
 
     Raises ScenarioError with one line.
     """
@@ -439,6 +439,18 @@ def overlaid(name: str, overlay: dict[str, Any]) -> Loaded:
     part = part_of(name)
     if part:
         content = _in_part(_place(path, case), content, part)
+    return _loaded(path, case, cases, part, _Content(content))
+
+
+class _Content(dict[str, Any]):
+    """What a scenario states, as a key: it is not changed any more."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(repr(self))
+
+
+@lru_cache(maxsize=64)
+def _loaded(path: Path, case: str, cases: tuple[str, ...], part: str, content: _Content) -> Loaded:
     try:
         scenario = msgspec.convert(content, Scenario)
     except msgspec.ValidationError as error:

@@ -40,7 +40,7 @@ def scenario(tmp_path):
     def scenario(text, base="subway-paper"):
         path = tmp_path / "mine.toml"
         path.write_text(f'base = "{base}"\n{text}')
-        return load.__wrapped__(str(path))
+        return load(str(path))
 
     return scenario
 

@@ -21,7 +21,7 @@ def line(tmp_path):
     def write(text, base="line-paper"):
         path = tmp_path / "mine.toml"
         path.write_text(f'base = "{base}"\n{text}')
-        return load.__wrapped__(str(path))
+        return load(str(path))
 
     return write
 

@@ -264,7 +264,7 @@ def test_a_single_train_has_no_radio():
 def drawn(tmp_path: Path, text: str, train: int = 1, run: int = 1):
     path = tmp_path / "radio.toml"
     path.write_text(f'base = "line"\n[line.radio]\n{text}')
-    loaded = members(load.__wrapped__(str(path)))[train]
+    loaded = members(load(str(path)))[train]
     return world.chance(loaded, 1, run)
 
 

@@ -424,3 +424,18 @@ def test_scenarios_with_one_plan_share_it_and_others_do_not():
     assert shorter.profile.position_m[-1] < one.profile.position_m[-1]
     finer = overlaid("subway", {"period_s": 0.005})
     assert len(finer.profile.x) > len(one.profile.x)
+
+
+def test_a_file_that_was_edited_is_read_again_and_so_is_its_base(write):
+    write('base = "subway"\nruns = 3\n', "base.toml")
+    mine = write('base = "base.toml"\nlaw = "pdilc"\n')
+    loaded = load(mine)
+    assert (loaded.scenario.runs, loaded.scenario.law) == (3, "pdilc")
+    assert load(mine) is loaded
+    write('base = "base.toml"\nlaw = "adaptive"\n')
+    assert load(mine).scenario.law == "adaptive"
+    write('base = "subway"\nruns = 4\n', "base.toml")
+    assert load(mine).scenario.runs == 4
+    write('base = "base.toml"\nlaw = "pdilc"\n')
+    write('base = "subway"\nruns = 3\n', "base.toml")
+    assert load(mine) is loaded

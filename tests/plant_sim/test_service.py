@@ -124,7 +124,6 @@ def changed(file, old, new):
     assert old in SERVICE
     path = file.parent / "changed.toml"
     path.write_text(SERVICE.replace(old, new))
-    load.cache_clear()
     return str(path)
 
 
@@ -201,7 +200,6 @@ def lowered(file, more="", lower=LOWER):
     path = file.parent / "changed.toml"
     text = path.read_text().replace("max_speed_m_s = 15.0", "max_speed_m_s = 15.0\novertime_s = 25")
     path.write_text(text + lower + more)
-    load.cache_clear()
     return name
 
 
@@ -251,7 +249,6 @@ build_up_s = 1.0
     name = lowered(file, curves)
     path = file.parent / "changed.toml"
     path.write_text(path.read_text().replace('"margin"', '"etcs"'))
-    load.cache_clear()
     (run,) = ato_hil.simulate(name)
     assert run.row["faults"] == ["timetable re-based"]
     assert run.row["overspeed_margin_m_s"] > 0.05
@@ -276,7 +273,6 @@ def learning(file):
     rows = "\n".join(f"{key} = {value}" for key, value in gains.items())
     memory = "[control.memory]\ndecimation = 16\nlead_ticks = 25\n"
     path.write_text(f"{path.read_text()}\n{memory}\n[laws.cailc]\n{rows}\n")
-    load.cache_clear()
     return name
 
 

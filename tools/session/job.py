@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +36,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
 
 def load(job: Job) -> Loaded:
     """Its scenario. Raises ScenarioError."""
-    return _loaded(job.scenario, json.dumps(job.overlay, sort_keys=True))
-
-
-@lru_cache(maxsize=64)
-def _loaded(scenario: str, overlay: str) -> Loaded:
-    return overlaid(scenario, json.loads(overlay))
+    return overlaid(job.scenario, job.overlay)
 
 
 def numbers(job: Job) -> range:
