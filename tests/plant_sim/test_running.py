@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ato_hil.plant_sim import running
+from ato_hil.plant_sim import optimum, running
 from ato_hil.plant_sim.atp import Atp, StaticSpeed
 from ato_hil.plant_sim.planner import PlanError, ProfilePlan
 from ato_hil.plant_sim.profile import evaluate
@@ -165,6 +165,20 @@ def test_more_time_never_costs_more():
 
 def test_the_same_plan_gives_the_same_table():
     assert (table(plan())[0] == table(plan())[0]).all()
+
+
+def test_bounds_are_read_by_steps_that_are_interpreted_too(monkeypatch):
+    """A plan failed there, unless a compiled process had left it on the disk."""
+    asked = plan(distance_m=30.0, duration_s=25.0)
+
+    def slow_run():
+        bounds = running._bounds(asked, train(), 0.0)
+        return optimum.crawl(bounds, running._mesh(asked, bounds, LEVEL, 0.0))
+
+    compiled = slow_run()
+    monkeypatch.setattr(running, "INTERPRETED", True)
+    monkeypatch.setattr(optimum, "_assemble", optimum._assemble.py_func)
+    np.testing.assert_array_equal(slow_run(), compiled)
 
 
 def test_a_plan_is_kept_until_anything_that_it_depends_on_changes(tmp_path, monkeypatch):

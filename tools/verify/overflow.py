@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -230,18 +231,25 @@ def calibrated(law: str) -> list[np.ndarray]:
 
 def ask(*arguments: str) -> Report:
     """A Report of this module in a process of its own, where the steps are interpreted."""
+    given = _parsed(arguments)
+    for name in [given.scenario] if given.scenario else identity.scenarios_of(given.law):
+        load(name)  # leaves its plan on the disk: interpreted, each section takes minutes
     environment = {"ATO_HIL_INTERPRETED": "1"}
     return asked(Report, "ato_hil.tools.verify.overflow", list(arguments), environment)
 
 
-def main(arguments: list[str]) -> None:
-    """The process: `LAW --cases N` searches, `LAW --scenario S` runs."""
+def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     parser.add_argument("law")
     parser.add_argument("--cases", type=int, default=0)
     parser.add_argument("--scenario", default="")
     parser.add_argument("--ticks", type=int, default=0)
-    given = parser.parse_args(arguments)
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str]) -> None:
+    """The process: `LAW --cases N` searches, `LAW --scenario S` runs."""
+    given = _parsed(arguments)
     if not INTERPRETED:
         raise SystemExit("expected ATO_HIL_INTERPRETED=1")
     if given.scenario:
