@@ -54,7 +54,7 @@ def repeat(
     problems: list[str] = []
     if not tasks:
         return problems
-    progress(f"the {len(tasks)} worst runs again, for their traces")
+    progress("the worst runs again, for their traces")
     with closing(spread(make, tasks, min(cores(), len(tasks)))) as made:
         for at, digest in made:
             if isinstance(digest, Lost | TraceError):
