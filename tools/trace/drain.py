@@ -11,6 +11,8 @@ import threading
 from pathlib import Path
 
 PIECE = 1 << 20  # bytes
+# Where a descriptor of this process has a name; /dev/fd is a link, which small systems do not have.
+NAMES = next((each for each in ("/proc/self/fd", "/dev/fd") if os.path.isdir(each)), "")
 
 
 class Drain:
@@ -28,7 +30,7 @@ class Drain:
     @property
     def entrance(self) -> str:
         """Name of the pipe, for one who opens it to write; then call `opened`."""
-        return f"/dev/fd/{self._write}"
+        return f"{NAMES}/{self._write}"
 
     def opened(self) -> None:
         """The file is whole when all who opened the pipe have closed it."""
