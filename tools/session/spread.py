@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from ato_hil.can_dbc.child import safe_path
+from ato_hil.tools.session.interrupts import Interrupts
 
 ATTEMPTS = 2
 
@@ -113,10 +114,11 @@ class _Worker:
             self.end()
         before = set(multiprocessing.active_children())
         spawn = multiprocessing.get_context("spawn")
-        with safe_path():
+        with Interrupts() as interrupts, safe_path():  # a pool that is half begun cannot be ended
             self._pool = ProcessPoolExecutor(1, spawn, _begin)
             future = self._pool.submit(self._function, task.task)
         self._processes = set(multiprocessing.active_children()) - before
+        interrupts.check()
         return future
 
     def kill(self) -> None:

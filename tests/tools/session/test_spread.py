@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import process
 from pathlib import Path
 
 import pytest
@@ -110,3 +111,22 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
               Path(f"/proc/{worker}/cmdline").read_text() for worker in workers):  # fmt: skip
         assert time.monotonic() < ended, "a worker is still there"
         time.sleep(0.1)
+
+
+def test_ctrl_c_while_a_process_is_begun_waits_until_it_can_be_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    start = process._ExecutorManagerThread.start
+
+    def with_ctrl_c(thread: process._ExecutorManagerThread) -> None:
+        signal.raise_signal(signal.SIGINT)
+        start(thread)
+
+    monkeypatch.setattr(process._ExecutorManagerThread, "start", with_ctrl_c)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            next(spread(square, range(3), 2))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert multiprocessing.active_children() == []
