@@ -73,9 +73,14 @@ def _with_peer(
     ours: Callable[[], float], peer: str, theirs: Callable[[], float]
 ) -> tuple[float, str, float]:
     """Rate, peer and its rate, as a Figure has them. Raises what they raise."""
-    turns = [(ours(), theirs()) for _ in range(TURNS)]
-    fastest, of_peer = (max(rates) for rates in zip(*turns, strict=True))
+    fastest, of_peer = _in_turns(ours, theirs)
     return fastest, peer, of_peer
+
+
+def _in_turns(*measures: Callable[[], float], turns: int = TURNS) -> list[float]:
+    """The best rate of each, measured one after the other `turns` times."""
+    rates = [[measure() for measure in measures] for _ in range(turns)]
+    return [max(of_one) for of_one in zip(*rates, strict=True)]
 
 
 def watched_rates(bus: str) -> tuple[float, float]:
@@ -187,15 +192,11 @@ def fmu_rates(bus: str) -> tuple[float, float, float]:
             files[part] = Path(folder) / f"{part}.fmu"
             if missing := archive.write(module.unpacked(loaded, None), files[part]):
                 raise ExportError(missing)
-        turns = [
-            (
-                run_rate("fmu", "none", trace=False, **files),
-                run_rate("sil", "none", trace=False),
-                run_rate("hil", bus, trace=False),
-            )
-            for _ in range(TURNS)
-        ]
-    fmus, sil, hil = (max(rates) for rates in zip(*turns, strict=True))
+        fmus, sil, hil = _in_turns(
+            partial(run_rate, "fmu", "none", trace=False, **files),
+            partial(run_rate, "sil", "none", trace=False),
+            partial(run_rate, "hil", bus, trace=False),
+        )
     return fmus, sil, hil
 
 
