@@ -25,6 +25,7 @@ from pickle import loads
 from typing import Any
 
 import numba
+import numpy as np
 from numba.core import sigutils
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
@@ -233,6 +234,11 @@ def allow_interpreted() -> None:
     plant and controllers are, as its few other steps can be."""
     global _WITHOUT_COMPILER  # noqa: PLW0603 - of the process, as numba's own setting is
     _WITHOUT_COMPILER = True
+
+
+def rows(array: np.ndarray) -> Any:
+    """A structured array in the form that steps take."""
+    return array.view(np.recarray) if INTERPRETED else array
 
 
 def require_compiler() -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ato_hil.can_dbc.codec import mailboxes
-from ato_hil.can_dbc.step import INTERPRETED, step
+from ato_hil.can_dbc.step import rows, step
 from ato_hil.controller import library, memory, store
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.firmware import build_tick, state_dtype
@@ -51,11 +51,6 @@ class Controller:
     def memory_bytes(self) -> int:
         """Bytes of the learning memory, both generations."""
         return int(self.cells.nbytes)
-
-
-def rows(array: np.ndarray) -> Any:
-    """A structured array in the form that steps take."""
-    return array.view(np.recarray) if INTERPRETED else array
 
 
 @cache

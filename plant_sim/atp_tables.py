@@ -41,6 +41,7 @@ from ato_hil.plant_sim.atp import (
     dv_warning,
 )
 from ato_hil.plant_sim.brakes import Step, ticks_of
+from ato_hil.plant_sim.profile import NEVER
 from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
 
 SLOPE_PIECE_M = 20.0  # a gradient that changes counts as constant over so much, its worst
@@ -49,7 +50,6 @@ LEAST_DECELERATION_M_S2 = 0.05  # on the steepest downhill
 # Rotating mass that counts where it is not known: of the mass, as the standard has it.
 ROTATING_UPHILL, ROTATING_DOWNHILL = 0.15, 0.02
 INDICATION_LEAST_S = 5.0
-NEVER = 2**62  # tick
 SAME_PLACE_M = 1e-6  # a place plus and minus a length may differ from it by rounding
 
 

@@ -41,11 +41,11 @@ from ato_hil.can_dbc.faults import (
 from ato_hil.can_dbc.step import int64, step
 from ato_hil.plant_sim.atp import EMERGENCY_BRAKE
 from ato_hil.plant_sim.line import Fault
+from ato_hil.plant_sim.profile import NEVER
 
 FAILURES_MAX = 16  # of a file
 CARS_MAX = 8
 ANY_RUN = -1
-NEVER = 2**62  # tick
 SPEED, POSITION = 0, 1
 QUANTITIES = {"speed": SPEED, "position": POSITION}
 

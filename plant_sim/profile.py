@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 SEGMENT = np.dtype([("ticks", np.int32), ("jerk", np.int32)], align=True)
 
 POSITION_UNIT_M = 2.0**-40
+NEVER = 2**62  # a tick that no run comes to
 LONGEST_PROFILE_S = 32768  # position at the top speed of Q24 stays within 64 bits
 INT32 = np.iinfo(np.int32)
 RATE_BITS = 24  # of the timetable's rate against the planned one

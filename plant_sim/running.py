@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ato_hil.can_dbc import cache
-from ato_hil.can_dbc.step import INTERPRETED, cache_directory
+from ato_hil.can_dbc.step import cache_directory, rows
 from ato_hil.plant_sim import atp, optimum
 from ato_hil.plant_sim.atp_tables import static_speeds
 from ato_hil.plant_sim.optimum import BOUNDS, Infeasible, Mesh
@@ -157,8 +157,7 @@ def work_j(profile: Profile, train: point.Train, line: Road) -> tuple[float, flo
 
 
 def _bounds(plan: ProfilePlan, train: point.Train, spare: float) -> np.void:
-    record = np.zeros(1, BOUNDS)
-    bounds: np.void = (record.view(np.recarray) if INTERPRETED else record)[0]
+    bounds: np.void = rows(np.zeros(1, BOUNDS))[0]
     source = train.resistance
     bounds["constant"], bounds["linear"], bounds["square"] = (
         source.constant[0], source.linear[0], source.square[0],

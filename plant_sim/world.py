@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ato_hil.can_dbc.codec import MAILBOX, MESSAGE_COUNT, NEIGHBOUR_AHEAD_POSITION
-from ato_hil.can_dbc.step import INTERPRETED, step
+from ato_hil.can_dbc.step import rows, step
 from ato_hil.plant_sim import (
     actuator,
     atp,
@@ -24,7 +24,7 @@ from ato_hil.plant_sim import (
     track,
 )
 from ato_hil.plant_sim.line import TRAINS_MAX
-from ato_hil.plant_sim.profile import RATE_ONE, rate_of, stretched_ticks
+from ato_hil.plant_sim.profile import NEVER, RATE_ONE, rate_of, stretched_ticks
 from ato_hil.plant_sim.scenario import (
     MODELS,
     Loaded,
@@ -42,7 +42,6 @@ SPEED_NOISE, DISTURBANCE, LOST_AHEAD, LOST_BEHIND = 0, 1, 2, 3
 STREAMS = 4  # of a train
 START = STREAMS * TRAINS_MAX  # and the number of the train: where it stands
 RUN_LENGTH = LOST_AHEAD  # of a run: the leader has no train ahead whose packets are lost
-NEVER = 2**62  # tick
 TICKS_AT_ONCE = 4096  # for which noise is drawn: what it takes stays in the processor's cache
 
 
@@ -89,11 +88,6 @@ class World:
         if changed or rate != int(self.state[0]["node"]["timetable_rate"]):
             self.limits = supervised(at_rate(self.members[0], rate))
         self.state["node"]["timetable_rate"] = rate
-
-
-def rows(array: np.ndarray) -> Any:
-    """A structured array in the form that steps take."""
-    return array.view(np.recarray) if INTERPRETED else array
 
 
 def build(loaded: Loaded, seed: int, fails: Sequence[failures.AnyFailure] = ()) -> World:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from ato_hil.can_dbc import e2e
 from ato_hil.can_dbc.codec import FORCE_CMD, put, saturate
+from ato_hil.can_dbc.step import rows
 from ato_hil.plant_sim import (
     atp,
     atp_tables,
@@ -34,16 +35,16 @@ def brake(*steps, build_up_s=1.0):
 def limits_for(settings_of_atp, sections=LEVEL, period_s=0.01, a_1=1.2, a_2=0.1, limit=60.0):
     times = np.array([(2**62, limit)], atp.LIMIT)
     made = atp_tables.supervised(settings_of_atp, times, sections, period_s, a_1, a_2)
-    return atp.Limits(*map(world.rows, made))
+    return atp.Limits(*map(rows, made))
 
 
 class Supervisor:
     """ATP by itself."""
 
     def __init__(self, settings_of_atp, limits=None):
-        self.params = world.rows(atp.calibrate(settings_of_atp))
+        self.params = rows(atp.calibrate(settings_of_atp))
         self.limits = limits or limits_for(settings_of_atp)
-        self.state = world.rows(np.zeros(1, atp.STATE))
+        self.state = rows(np.zeros(1, atp.STATE))
         atp.reset(self.state[0])
 
     def at(self, position_m, speed_m_s=0.0, tick=0):

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ato_hil.plant_sim import actuator, brakes, world
+from ato_hil.can_dbc.step import rows
+from ato_hil.plant_sim import actuator, brakes
 
 PERIOD_S = 0.01
 SERVICE = brakes.Brake(steps=[brakes.Step(deceleration_m_s2=0.8)], build_up_s=0.04)
@@ -23,11 +24,9 @@ class Rig:
 
     def __init__(self, cut_off_s=0.03):
         masses_kg = [1e3, 3e3]
-        self.params = world.rows(
-            brakes.calibrate(SERVICE, EMERGENCY, cut_off_s, masses_kg, PERIOD_S)
-        )[0]
-        self.state = world.rows(np.zeros(1, brakes.STATE))[0]
-        self.actuator = world.rows(np.zeros(1, actuator.STATE))[0]
+        self.params = rows(brakes.calibrate(SERVICE, EMERGENCY, cut_off_s, masses_kg, PERIOD_S))[0]
+        self.state = rows(np.zeros(1, brakes.STATE))[0]
+        self.actuator = rows(np.zeros(1, actuator.STATE))[0]
         brakes.reset(self.state)
 
     def tick(self, force=0.0, cut_off=0, service=0, emergency=0, speed=5.0):

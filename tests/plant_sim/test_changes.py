@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ato_hil.can_dbc.step import rows
 from ato_hil.controller.node import build
 from ato_hil.plant_sim import track, world
 from ato_hil.plant_sim.scenario import (
@@ -161,7 +162,7 @@ def test_a_swing_is_a_sine_on_top_of_the_track(wavelength_m, amplitude, places, 
     swing = Swing(from_m=100.0, to_m=900.0, wavelength_m=wavelength_m, amplitude_n_per_kn=amplitude)
     common = {"interpolation": interpolation, "from_m": places, "resistance_n_per_kn": steps}
     plain, swung = (
-        world.rows(track.sections(Track(**common, swings=swings))) for swings in ([], [swing])
+        rows(track.sections(Track(**common, swings=swings))) for swings in ([], [swing])
     )
     for at in (50.0, 130.0, 411.0, 640.0, 880.0, 950.0):
         if any(abs(at - place) < 0.02 for place in places):

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ato_hil.plant_sim import atp, atp_tables, track, world
+from ato_hil.can_dbc.step import rows
+from ato_hil.plant_sim import atp, atp_tables, track
 from ato_hil.plant_sim.atp import EBI, INDICATION, PERMITTED, SBI, WARN, Atp, Factor, StaticSpeed
 from ato_hil.plant_sim.brakes import Brake, Step
 
@@ -26,7 +27,7 @@ def steps_of(pairs):
 def limits_for(supervision, sections, a_1=0.0, a_2=0.0, limit=60.0, period_s=PERIOD_S):
     times = np.array([(2**62, limit)], atp.LIMIT)
     made = atp_tables.supervised(supervision, times, sections, period_s, a_1, a_2)
-    return atp.Limits(*map(world.rows, made))
+    return atp.Limits(*map(rows, made))
 
 
 def speed(limits, kind, position_m):
@@ -179,8 +180,8 @@ def test_near_the_end_of_authority_nothing_is_asked_below_the_release_speed_and_
     for kind in (PERMITTED, WARN, SBI, EBI):
         assert speed(limits, kind, 4999.0) == 5.0
         assert speed(limits, kind, 3000.0) > 5.0
-    state = world.rows(np.zeros(1, atp.STATE))
-    params = world.rows(atp.calibrate(Atp(**PEER)))
+    state = rows(np.zeros(1, atp.STATE))
+    params = rows(atp.calibrate(Atp(**PEER)))
     atp.reset(state[0])
     for position, speed_m_s, demand in (
         (4999.0, 5.0, atp.NORMAL),

@@ -432,14 +432,15 @@ def test_an_announcement_is_confirmed_only_by_its_own_state_and_run(run_state):
 
 DRIVE = """
 import numpy as np
-from plant_sim import plant, world
+from ato_hil.can_dbc.step import rows
+from ato_hil.plant_sim import plant, world
 from ato_hil.plant_sim.scenario import load
 
 for name in ("subway-paper", "subway", "subway-atp:short"):
     loaded = load(name)
     here = world.build(loaded, 3)
     chance = world.chances(here, 1)
-    truth = world.rows(np.zeros((1, 40), plant.TRUTH))
+    truth = rows(np.zeros((1, 40), plant.TRUTH))
     here.begin(here.params, here.state)
     if name == "subway-atp:short":  # where its curves are
         here.state["train"]["position_m"] = 2600.0

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ato_hil.can_dbc import step
 from ato_hil.plant_sim import optimum, running
 from ato_hil.plant_sim.atp import Atp, StaticSpeed
 from ato_hil.plant_sim.planner import PlanError, ProfilePlan
@@ -176,7 +177,7 @@ def test_bounds_are_read_by_steps_that_are_interpreted_too(monkeypatch):
         return optimum.crawl(bounds, running._mesh(asked, bounds, LEVEL, 0.0))
 
     compiled = slow_run()
-    monkeypatch.setattr(running, "INTERPRETED", True)
+    monkeypatch.setattr(step, "INTERPRETED", True)
     monkeypatch.setattr(optimum, "_assemble", optimum._assemble.py_func)
     np.testing.assert_array_equal(slow_run(), compiled)
 

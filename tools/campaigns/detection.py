@@ -22,8 +22,8 @@ from ato_hil.can_dbc.codec import (
 )
 from ato_hil.can_dbc.e2e import COUNTER_PERIOD
 from ato_hil.can_dbc.faults import CONTROLLER, PLANT, Frame
+from ato_hil.can_dbc.step import rows
 from ato_hil.controller.interface import GUARD_SERVICE_BRAKE
-from ato_hil.controller.node import rows
 from ato_hil.tools.session.sil_faults import Side
 
 # What each side reads in a run of a train with six cars; the others are for the traces.

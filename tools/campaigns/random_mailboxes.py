@@ -20,7 +20,7 @@ from ato_hil.can_dbc.codec import (
     MESSAGES,
     get,
 )
-from ato_hil.can_dbc.step import int64, step
+from ato_hil.can_dbc.step import int64, rows, step
 from ato_hil.controller import node as controller_node
 from ato_hil.controller.interface import RUNNING
 from ato_hil.plant_sim import plant, world
@@ -135,8 +135,8 @@ def run(scenario: str, words: int, seed: int) -> Outcome:
     here.begin(here.params, here.state)
     chance, truth = np.zeros((1, 1), plant.CHANCE), np.zeros((1, 1), plant.TRUTH)
     applied = build_plant_loop(here.actuate_and_advance)(
-        *(ticks, here.params, here.track, here.state, world.rows(chance), here.rx),
-        *(world.rows(truth), counters, start),
+        *(ticks, here.params, here.track, here.state, rows(chance), here.rx),
+        *(rows(truth), counters, start),
     )
     limit_n = loaded.scenario.actuator.force_max_m_s2 * loaded.scenario.train.mass_kg
     return Outcome(

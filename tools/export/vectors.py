@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ato_hil.can_dbc.step import rows
 from ato_hil.controller import node as controller_node
 from ato_hil.plant_sim import plant, world
 from ato_hil.plant_sim.scenario import Loaded
@@ -68,7 +69,7 @@ def record(loaded: Loaded, law: str, ticks_max: int = TICKS, runs: int = RUNS) -
         here.begin(here.params, here.state)
         chance = world.chances(here, run)
         ticks = min(ticks_max, chance.shape[1])
-        truth = world.rows(np.zeros(chance.shape, plant.TRUTH))
+        truth = rows(np.zeros(chance.shape, plant.TRUTH))
         for tick in range(ticks):
             for train in range(len(here.members)):
                 sil.clear(here.tx[train])

@@ -26,6 +26,7 @@ import numpy as np
 
 from ato_hil.can_dbc import child
 from ato_hil.can_dbc.codec import MESSAGE_COUNT
+from ato_hil.can_dbc.step import rows
 from ato_hil.controller import library
 from ato_hil.controller.calibration import Calibration
 from ato_hil.controller.interface import fault_names
@@ -338,7 +339,7 @@ def _drive(
 ) -> list[int]:
     """One run; fills `truth` and `frames`. How many frames there are of each train."""
     counts = [0] * len(started)
-    rows = world.rows(truth)
+    shown = rows(truth)
     for tick in range(truth.shape[1]):
         for train in range(len(started)):
             sil.clear(here.tx[train])
@@ -357,7 +358,7 @@ def _drive(
                 )
         except RunError as error:
             raise RunError(f"tick {tick} of run {run}: {error}") from None
-        here.actuate_and_advance(here.params, here.track, here.state, chance, tick, here.rx, rows)
+        here.actuate_and_advance(here.params, here.track, here.state, chance, tick, here.rx, shown)
         if progress and tick % PROGRESS_TICKS == 0:
             progress(run, tick)
     return counts

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ato_hil.can_dbc.codec import MESSAGE_COUNT, MESSAGES
-from ato_hil.can_dbc.step import INTERPRETED, step
+from ato_hil.can_dbc.step import INTERPRETED, rows, step
 from ato_hil.controller import node as controller_node
 from ato_hil.controller.interface import fault_names
 from ato_hil.plant_sim import plant, world
@@ -138,7 +138,7 @@ def run_line(
     number = runs.start
     # Compiles, or loads what was compiled before.
     kinds = (plant.CHANCE, plant.TRUTH, FRAME)
-    drive(0, *(world.rows(np.zeros((trains, 0), kind)) for kind in kinds))
+    drive(0, *(rows(np.zeros((trains, 0), kind)) for kind in kinds))
     for number in runs:
         if progress:
             progress(number, 0)
@@ -151,7 +151,7 @@ def run_line(
         # As many rows as there could be; the system gives memory to those that are written.
         frames = np.empty((trains, ticks * MESSAGE_COUNT), FRAME)
         started = time.perf_counter()
-        drive(ticks, chance, world.rows(truth), world.rows(frames))
+        drive(ticks, chance, rows(truth), rows(frames))
         seconds = time.perf_counter() - started
         faults = [fault_names(int(node.state[0]["core"]["faults"])) for node in nodes]
         _announce(here, nodes, plant.ENDED, number)
@@ -178,8 +178,8 @@ def _put_side_by_side(
 ) -> tuple[Any, Any, Any]:
     """Params, state and memories of all controllers as arrays; the controllers keep views of their
     rows, and of the plant's mailboxes, which are the buses."""
-    params = world.rows(np.zeros(len(nodes), nodes[0].params.dtype))
-    state = world.rows(np.zeros(len(nodes), nodes[0].state.dtype))
+    params = rows(np.zeros(len(nodes), nodes[0].params.dtype))
+    state = rows(np.zeros(len(nodes), nodes[0].state.dtype))
     cells = np.stack([node.cells for node in nodes])
     for train, node in enumerate(nodes):
         params[train], state[train] = node.params[0], node.state[0]

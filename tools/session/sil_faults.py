@@ -25,6 +25,7 @@ from ato_hil.can_dbc.faults import (
     in_order,
 )
 from ato_hil.can_dbc.inbox import Inbox, fresh_frames
+from ato_hil.can_dbc.step import rows
 from ato_hil.controller import node as controller_node
 from ato_hil.controller.interface import fault_names
 from ato_hil.controller.process import inbox_of
@@ -147,7 +148,7 @@ def _drive(
     for side in sides:
         side.to_controller.begin_run(run)
         side.to_plant.begin_run(run)
-    rows = world.rows(truth)
+    shown = rows(truth)
     for tick in range(truth.shape[1]):
         here.sense(here.params, here.limits, here.state, chance, tick, here.tx)
         answers = []
@@ -162,7 +163,7 @@ def _drive(
                 return f"{name} is silent: no {FORCE_CMD.name} for tick {tick} of run {run}"
             side.to_plant.close_tick()
             answers.append(answer)
-        here.actuate_and_advance(here.params, here.track, here.state, chance, tick, here.rx, rows)
+        here.actuate_and_advance(here.params, here.track, here.state, chance, tick, here.rx, shown)
         if watch:
             for side, answer in zip(sides, answers, strict=True):
                 watch.applied(side, tick, answer)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ato_hil.can_dbc.codec import MESSAGES, get
+from ato_hil.can_dbc.step import rows
 from ato_hil.plant_sim import plant, world
 from ato_hil.plant_sim.scenario import load, shortened
 from ato_hil.tools.export import ExportError
@@ -67,8 +68,8 @@ def driven(loaded, node, runs):
         announce(plant.ARMED, run)
         here.begin(here.params, here.state)
         chance = world.chances(here, run)
-        truth = world.rows(np.zeros(chance.shape, plant.TRUTH))
-        rows = []
+        truth = rows(np.zeros(chance.shape, plant.TRUTH))
+        frames = []
         for tick in range(chance.shape[1]):
             sil.clear(here.tx[0])
             here.sense(here.params, here.limits, here.state, chance, tick, here.tx)
@@ -77,12 +78,12 @@ def driven(loaded, node, runs):
             for message, payload in gave:
                 here.rx[0][message.index]["payload"] = payload
                 here.rx[0][message.index]["fresh"] = 1
-            rows += [(tick, message.frame_id, payload) for message, payload in (*had, *gave)]
+            frames += [(tick, message.frame_id, payload) for message, payload in (*had, *gave)]
             here.actuate_and_advance(
                 here.params, here.track, here.state, chance, tick, here.rx, truth
             )
         announce(plant.ENDED, run)
-        yield np.array(rows, FRAME)
+        yield np.array(frames, FRAME)
 
 
 def digests(frames):
