@@ -207,6 +207,44 @@ def test_an_integer_step_and_float_calibration_pass():
     assert not [use for function in steps(tree) for use in float_uses(function)]
 
 
+# What is written is what an installation has.
+
+BARE_IMPORT = re.compile(
+    rf"\bfrom ({'|'.join(MAY_IMPORT)})(\.\w+)* import\b|\bimport ({'|'.join(MAY_IMPORT)})\.\w"
+    rf"|-m ({'|'.join(MAY_IMPORT)})\."
+)
+
+
+def test_nothing_imports_a_folder_by_its_own_name():
+    """Not in scripts within tests and in pages, either: installed, there is ato_hil alone."""
+    found = [
+        f"{relative(path)}:{number}: {line.strip()}"
+        for path in repository_files()
+        for number, line in enumerate(
+            path.read_text(encoding="utf-8", errors="ignore").splitlines(), start=1
+        )
+        if BARE_IMPORT.search(line)
+    ]
+    assert not found
+
+
+@pytest.mark.parametrize("folder", MAY_IMPORT)
+@pytest.mark.parametrize(
+    ("form", "is_bare"),
+    [
+        ("x = 'from {} import e2e'", True),
+        ("from {}.runs import can_logs", True),
+        ("import {}.atp", True),
+        ("python -m {}.cli.docs", True),
+        ("from ato_hil.{} import e2e", False),
+        ("python -P -m ato_hil.{}.cli.docs", False),
+        ("import {}, link", False),  # as in a folder of examples
+    ],
+)
+def test_a_bare_import_is_seen(form, is_bare, folder):
+    assert bool(BARE_IMPORT.search(form.format(folder))) == is_bare
+
+
 # No machine is named in the repository.
 
 

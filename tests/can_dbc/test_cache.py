@@ -171,7 +171,7 @@ def test_a_full_disk_is_said_once_and_leaves_nothing(
 
 COUNTED = """
 import json
-from can_dbc import e2e
+from ato_hil.can_dbc import e2e
 
 e2e.check(e2e.protect(1 << 20, 3, 7), -1, 7)
 stats = [each.stats for each in (e2e.protect, e2e.check)]
@@ -203,7 +203,7 @@ def test_damaged_code_is_compiled_again(tmp_path: Path) -> None:
 
 
 def test_a_setting_that_changes_the_code_has_code_of_its_own(tmp_path: Path) -> None:
-    script = "from can_dbc import e2e; print(e2e.protect(1 << 20, 3, 7), e2e.protect.stats)"
+    script = "from ato_hil.can_dbc import e2e; print(e2e.protect(1 << 20, 3, 7), e2e.protect.stats)"
     found = []
     for setting in ({}, {"NUMBA_OPT": "0"}, {"NUMBA_BOUNDSCHECK": "1"}, {}):
         done = subprocess.run(
@@ -221,7 +221,7 @@ def test_a_setting_that_changes_the_code_has_code_of_its_own(tmp_path: Path) -> 
 
 def test_without_the_compiler_steps_say_so_in_one_line() -> None:
     script = (
-        "from can_dbc import e2e\n"
+        "from ato_hil.can_dbc import e2e\n"
         "try:\n"
         "    e2e.protect(1 << 20, 3, 7)\n"
         "except ValueError as error:\n"

@@ -149,7 +149,7 @@ def test_fields_of_records_are_widened(a: int, b: int) -> None:
 SAME = """
 import json, random
 import numpy as np
-from can_dbc import e2e
+from ato_hil.can_dbc import e2e
 from ato_hil.can_dbc.codec import MESSAGES, Signal, get, put, saturate
 from ato_hil.can_dbc.step import INTERPRETED, int64
 
@@ -230,7 +230,7 @@ def test_a_step_that_would_allocate_is_refused(function: Any, argument: Any) -> 
 
 CACHED = """
 import json
-from can_dbc import e2e
+from ato_hil.can_dbc import e2e
 from ato_hil.can_dbc.codec import FORCE_CMD, get, put, saturate
 
 calls = [

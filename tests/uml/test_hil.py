@@ -24,7 +24,7 @@ def run(folder: Path, *arguments: str, before: tuple[str, ...] = (), **environme
     done = subprocess.run(
         [*before, sys.executable, "-m", "ato_hil", "run", str(SCENARIO), *arguments],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), **environment},
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2] / "src"), **environment},
         capture_output=True,
         text=True,
         timeout=LIMIT_S,

@@ -359,7 +359,7 @@ from pathlib import Path
 import can
 import numpy as np
 from can.io.mf4 import MF4Reader, MF4Writer
-from tools import record
+from ato_hil.tools.runs import can_logs
 from ato_hil.tools.runs.frames import FRAME
 
 rows = np.zeros(2500, FRAME)

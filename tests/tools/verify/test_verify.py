@@ -192,7 +192,7 @@ def test_no_input_makes_a_law_overflow(law):
 WORKER = """
 import importlib.util, json, sys
 import msgspec
-from controller import registry
+from ato_hil.controller import registry
 from ato_hil.tools.verify import overflow
 spec = importlib.util.spec_from_file_location("mutant.pid", sys.argv[1])
 module = importlib.util.module_from_spec(spec)
