@@ -13,8 +13,8 @@ import msgspec
 HEAD = struct.Struct("<cI")  # kind and length of what follows
 COUNT = struct.Struct("<I")
 
-# Requests: open (JSON of Wanted), reset, step (rows of inputs), event and turn (operations of a
-# bus), verify.
+# Requests: open (JSON of Wanted), reset (the first one loads it), step (rows of inputs), event and
+# turn (operations of a bus), verify.
 # An answer has the same kind, or ERROR with one line.
 OPEN, RESET, STEP, EVENT, TURN, VERIFY, ERROR = b"O", b"R", b"S", b"N", b"T", b"V", b"E"
 
@@ -36,8 +36,10 @@ class Wanted(msgspec.Struct, frozen=True):
     inputs: list[Port]
     outputs: list[Port]
     step_s: float
+    part: str  # what it is of: controller, plant, train
     bus_outputs: list[Port] | None = None  # instead of inputs and outputs if it is a CAN node
     start: dict[str, float] = {}  # parameters by name
+    scenario: str = ""  # digest that one of ours has to be made for, if that matters
     keeps: bool = False  # requests since the last reset, so that they can be verified
 
 
@@ -45,9 +47,9 @@ class Opened(msgspec.Struct, frozen=True):
     """What an FMU then has: names in the order of the bytes, numbers of type double first."""
 
     fmi: str
-    version: str  # of the model, as its maker has put it
     real_inputs: list[str]
     whole_inputs: list[str]
     real_outputs: list[str]
     whole_outputs: list[str]
     has_bus: bool
+    needs_tool: bool  # a program of its maker, which loading it starts

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import os
+import re
 import socket
 import sys
 import zipfile
@@ -32,8 +33,11 @@ from ato_hil.plant_sim.fmi import (
     Opened,
     Port,
     Wanted,
+    archive,
 )
+from ato_hil.plant_sim.fmi.archive import FmuError
 
+MADE_FOR = re.compile(r"(\w+), scenario (\w+)")  # how an FMU of ours says it
 TRANSCEIVER = "org.fmi-ls-bus.transceiver"
 ITERATIONS_MAX = 50  # of one event
 TEXT_MOST = 400  # characters of an error: names and texts in it are of others
@@ -52,10 +56,6 @@ UNITS: dict[str, tuple[dict[str, int], tuple[str, ...]]] = {
     "N": ({"kg": 1, "m": 1, "s": -2}, ("newton", "kg.m/s2", "kg.m.s-2")),
     "kg": ({"kg": 1}, ("kilogram",)),
 }
-
-
-class FmuError(Exception):
-    """The FMU is not what it has to be; one line."""
 
 
 class Group:
@@ -125,13 +125,25 @@ class Fmu:
 
     def __init__(self, wanted: Wanted, folder: Path) -> None:
         self.wanted = wanted
-        self.description = described(wanted.file)
-        self.fmi = "2.0" if self.description.fmiVersion == "2.0" else "3.0"
-        self.variables = {v.name: v for v in self.description.modelVariables}
-        self.said = ""  # the last trouble that it told of in the request under way
-        refuse_without_binary(wanted.file, self.fmi, self.description)
-        may_have_bus = wanted.bus_outputs is not None and self.fmi == "3.0"
-        self.bus = bus_of(wanted.file, self.variables) if may_have_bus else {}
+        with archive.opened(wanted.file) as packed:
+            self.description = described(wanted.file, packed)
+            refuse_another(wanted, self.description)
+            self.fmi = "2.0" if self.description.fmiVersion == "2.0" else "3.0"
+            self.variables = {v.name: v for v in self.description.modelVariables}
+            self.said = ""  # the last trouble that it told of in the request under way
+            refuse_without_binary(wanted.file, packed.namelist(), self.fmi, self.description)
+            may_have_bus = wanted.bus_outputs is not None and self.fmi == "3.0"
+            self.bus = bus_of(packed, self.variables) if may_have_bus else {}
+            self._find_ports(wanted)
+            archive.unpack(packed, folder)
+        self.folder = folder
+        self.slave: Any = None
+        self.time_s = 0.0
+        self.steps = 0
+        self.log: list[bytes] = []
+        self.seen = hashlib.blake2b()
+
+    def _find_ports(self, wanted: Wanted) -> None:
         inputs, outputs = wanted.inputs, wanted.outputs
         if self.bus:
             inputs, outputs = [], wanted.bus_outputs or []
@@ -139,29 +151,21 @@ class Fmu:
         self.outputs = Ports(self._ports(outputs, "output"), self.fmi)
         for name, value in wanted.start.items():
             self._check_parameter(name, value)
-        from fmpy import extract
-
-        try:
-            self.folder = extract(wanted.file, unzipdir=str(folder))
-        except Exception as error:  # of a foreign archive, or of the disk
-            why = error.strerror if isinstance(error, OSError) else error
-            raise FmuError(f"cannot be unpacked: {why}") from None
-        self.slave: Any = None
-        self.time_s = 0.0
-        self.steps = 0
-        self.log: list[bytes] = []
-        self.seen = hashlib.blake2b()
 
     def opened(self) -> Opened:
         """What there is."""
-        version = self.description.version or ""
         (real_in, whole_in), (real_out, whole_out) = self.inputs.names, self.outputs.names
-        return Opened(self.fmi, version, real_in, whole_in, real_out, whole_out, bool(self.bus))
+        return Opened(
+            *(self.fmi, real_in, whole_in, real_out, whole_out, bool(self.bus)),
+            bool(self.description.coSimulation.needsExecutionTool),
+        )
 
     def _ports(self, ports: Sequence[Port], causality: str) -> list[Any]:
         found = []
         for port in ports:
-            at = f"key {port.key}: " if port.key else ""
+            at = f"key {port.key}: "
+            if not port.key:
+                at = f"{self.description.modelName!r}, expected the FMU of a {self.wanted.part}: "
             variable = self.variables.get(port.name)
             if variable is None:
                 if port.needed:
@@ -352,13 +356,18 @@ class Fmu:
         return again.digest() == self.seen.digest()
 
 
-def described(file: str) -> Any:
+def described(file: str, packed: zipfile.ZipFile) -> Any:
     """The model description. Raises FmuError."""
     try:
         from fmpy import read_model_description
     except ImportError:
         raise FmuError("FMPy is not installed, try: pip install 'ato-hil[fmi]'") from None
-    version = version_of(file)
+    root = xml_of(packed, "modelDescription.xml")
+    if root is None:
+        raise FmuError("no FMU: there is no modelDescription.xml in it")
+    if root.tag != "fmiModelDescription":
+        raise FmuError(f"no FMU: modelDescription.xml has {root.tag}, expected fmiModelDescription")
+    version = root.get("fmiVersion", "without a version")
     if version != "2.0" and not version.startswith("3.0"):
         raise FmuError(f"is of FMI {version}, expected 2.0 or 3.0")
     try:
@@ -372,31 +381,36 @@ def described(file: str) -> Any:
     return description
 
 
-def version_of(file: str) -> str:
-    """That of FMI. Raises FmuError."""
+def xml_of(packed: zipfile.ZipFile, name: str) -> Any:
+    """The root of a description, None if there is none. Raises FmuError."""
     from xml.etree import ElementTree
 
+    text = archive.text(packed, name)
     try:
-        with zipfile.ZipFile(file) as archive:
-            root = ElementTree.fromstring(archive.read("modelDescription.xml"))
-    except KeyError:
-        raise FmuError("no FMU: there is no modelDescription.xml in it") from None
+        return None if text is None else ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise FmuError(f"no FMU: modelDescription.xml: {error}") from None
-    except Exception as error:  # of a foreign archive: damaged, encrypted, packed in other ways
-        raise FmuError(f"no FMU: {error or type(error).__name__}") from None
-    if root.tag != "fmiModelDescription":
-        raise FmuError(f"no FMU: modelDescription.xml has {root.tag}, expected fmiModelDescription")
-    return root.get("fmiVersion", "without a version")
+        raise FmuError(f"no FMU: {name}: {error}") from None
 
 
-def refuse_without_binary(file: str, fmi: str, description: Any) -> None:
-    """Raises FmuError if there is no binary for this machine."""
+def refuse_another(wanted: Wanted, description: Any) -> None:
+    """Raises FmuError for an FMU of ours that was made for something else."""
+    found = MADE_FOR.match(description.version or "")
+    if found is None:
+        return
+    part, scenario = found.groups()
+    if wanted.part and part != wanted.part:
+        raise FmuError(
+            f"{description.modelName!r}, the FMU of a {part}, expected that of a {wanted.part}"
+        )
+    if wanted.scenario and scenario != wanted.scenario:
+        raise FmuError(f"made for scenario {scenario}, expected {wanted.scenario}")
+
+
+def refuse_without_binary(file: str, names: list[str], fmi: str, description: Any) -> None:
+    """Raises FmuError if among the members there is no binary for this machine."""
     import fmpy
 
     platform = fmpy.platform if fmi == "2.0" else fmpy.platform_tuple
-    with zipfile.ZipFile(file) as archive:
-        names = archive.namelist()
     has = {name.split("/")[1] for name in names if name.startswith("binaries/")} - {""}
     library = f"{description.coSimulation.modelIdentifier}{fmpy.sharedLibraryExtension}"
     if f"binaries/{platform}/{library}" in names:
@@ -410,17 +424,11 @@ def refuse_without_binary(file: str, fmi: str, description: Any) -> None:
     )
 
 
-def bus_of(file: str, variables: dict[str, Any]) -> dict[str, int]:
+def bus_of(packed: zipfile.ZipFile, variables: dict[str, Any]) -> dict[str, int]:
     """Value references of the members of its CAN terminal; empty if it has none."""
-    from xml.etree import ElementTree
-
-    with zipfile.ZipFile(file) as archive:
-        try:
-            root = ElementTree.fromstring(archive.read("terminalsAndIcons/terminalsAndIcons.xml"))
-        except KeyError:
-            return {}
-        except ElementTree.ParseError as error:
-            raise FmuError(f"terminalsAndIcons.xml: {error}") from None
+    root = xml_of(packed, "terminalsAndIcons/terminalsAndIcons.xml")
+    if root is None:
+        return {}
     buses = [t for t in root.iter("Terminal") if t.get("matchingRule") == TRANSCEIVER]
     if len(buses) > 1:
         raise FmuError(f"has {len(buses)} buses, expected one")
@@ -460,7 +468,6 @@ def serve(line: socket.socket, folder: Path) -> None:
         try:
             if kind == OPEN:
                 fmu = Fmu(msgspec.json.decode(content, type=Wanted), folder)
-                fmu.start()
                 given = msgspec.json.encode(fmu.opened())
             else:
                 assert fmu is not None

@@ -33,8 +33,9 @@ from ato_hil.plant_sim.fmi import (
     Wanted,
 )
 
-ANSWER_S = 20.0  # for the answer to a step
-OPEN_S = 120.0  # for a large file to be unpacked and loaded
+ANSWER_S = 20.0  # for a call of the FMU: to load it, too
+TOOL_S = 120.0  # to load one that has to start the program of its maker
+OPEN_S = 120.0  # for a large file to be unpacked; nothing of the FMU itself runs
 
 
 class FmuError(InputError):
@@ -46,7 +47,7 @@ class Fmu:
 
     def __init__(self, file: str, process: subprocess.Popen[bytes], line: socket.socket) -> None:
         self.file, self._process, self._line = file, process, line
-        self.opened = Opened("", "", [], [], [], [], False)
+        self.opened = Opened("", [], [], [], [], False, False)
         self.inputs: list[str] = []  # names, in the order of a row
         self.outputs: list[str] = []
         self._in = self._out = struct.Struct("<")
@@ -54,13 +55,14 @@ class Fmu:
         self.repeats = True  # as far as `verify` has found
 
     def open(self, wanted: Wanted) -> None:
-        """Asks for what is wanted. Raises FmuError."""
+        """Asks for what is wanted, and loads it. Raises FmuError."""
         answer = self.ask(OPEN, msgspec.json.encode(wanted), OPEN_S)
         opened = self.opened = msgspec.json.decode(answer, type=Opened)
         self.inputs = [*opened.real_inputs, *opened.whole_inputs]
         self.outputs = [*opened.real_outputs, *opened.whole_outputs]
         self._in = struct.Struct(f"<{len(opened.real_inputs)}d{len(opened.whole_inputs)}q")
         self._out = struct.Struct(f"<{len(opened.real_outputs)}d{len(opened.whole_outputs)}q")
+        self.ask(RESET, seconds=TOOL_S if opened.needs_tool else None)
 
     def ask(self, kind: bytes, content: bytes = b"", seconds: float | None = None) -> bytes:
         """The answer to a request, within `seconds`, or ANSWER_S. Raises FmuError."""
@@ -93,7 +95,8 @@ class Fmu:
             except BlockingIOError:
                 if self._process.poll() is not None:  # a child of its own holds the line open
                     raise FmuError(self._end()) from None
-                raise FmuError(f"{self.file}: it hangs: no answer to a call") from None
+                limit = f"no answer to a call within {self._limit_s:g} s"
+                raise FmuError(f"{self.file}: it hangs: {limit}") from None
             except ConnectionError:
                 part = b""
             if not part:

@@ -176,6 +176,7 @@ class Host:
             [Port(name, "train.force", "N", "real") for name in names],
             outputs,
             period_s / train.substeps,
+            "train",
             start=train.parameters,
             keeps=True,
         )

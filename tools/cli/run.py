@@ -362,15 +362,19 @@ def _run(options: Options, screen: Screen) -> dict[str, Any]:
             summary = session.run(options, screen)
     except RunError as error:
         _print_table(screen)
-        failure = fail(f"{error}; the runs so far are in {options.out}", EXIT_ENDED_EARLY)
+        failure = fail(f"{error}{_kept(options.out)}", EXIT_ENDED_EARLY)
         _wait_for(options.viewer)
         raise failure from None
     except KeyboardInterrupt:
         _print_table(screen)
-        text = f"interrupted; the runs so far are in {options.out}"
-        raise fail(text, EXIT_INTERRUPTED) from None
+        raise fail(f"interrupted{_kept(options.out)}", EXIT_INTERRUPTED) from None
     _print_table(screen)
     return summary
+
+
+def _kept(out: Path) -> str:
+    """Where the results are of a session that ends early, if it has any."""
+    return f"; the runs so far are in {out}" if any(out.iterdir()) else ""
 
 
 def _print_end(summary: dict[str, Any], options: Options) -> None:

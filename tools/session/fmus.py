@@ -6,7 +6,6 @@ frames, as `ato-hil export fmu --bus none` has them. The frames are those of SIL
 
 from __future__ import annotations
 
-import re
 import struct
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -44,7 +43,6 @@ TRANSMIT, TRANSMIT_HEAD = 0x10, struct.Struct("<IIIBBH")
 OPERATION = struct.Struct("<II")
 PERIODS_WITHOUT_RUN = 100  # of a plant that arms none
 PROGRESS_TICKS = 500
-MADE_FOR = re.compile(r"(\w+), scenario (\w+)")
 
 Frame = tuple[int, int]  # identifier and payload
 
@@ -251,23 +249,17 @@ def _opened(
                 inputs.append(Port(f"{message.name}.{name}", kind="number" if is_raw else "real"))
     outputs = [Port(f"{name}.fresh") for name in sent]
     outputs += [Port(f"{name}.payload", kind="whole") for name in sent]
-    fmu = process.start(
-        Wanted(
-            str(file),
-            inputs,
-            [*outputs, *(Port(name) for name in more)],
-            loaded.scenario.period_s,
-            [Port(name) for name in more],
-            start,
-        ),
-        stack,
+    wanted = Wanted(
+        str(file),
+        inputs,
+        [*outputs, *(Port(name) for name in more)],
+        loaded.scenario.period_s,
+        part,
+        [Port(name) for name in more],
+        start,
+        scenario=loaded.digest,
     )
-    made_for = MADE_FOR.match(fmu.opened.version)
-    if made_for and made_for[1] != part:
-        raise FmuError(f"{file}: the FMU of a {made_for[1]}, expected that of a {part}")
-    if made_for and made_for[2] != loaded.digest:
-        raise FmuError(f"{file}: made for scenario {made_for[2]}, expected {loaded.digest}")
-    return fmu
+    return process.start(wanted, stack)
 
 
 def _node(fmu: Fmu, received: Sequence[str], sent: Sequence[str]) -> BusNode | SignalNode:

@@ -7,7 +7,7 @@ import pytest
 
 from ato_hil.plant_sim.fmi.process import FmuError
 from ato_hil.plant_sim.scenario import ScenarioError, load, overlaid
-from ato_hil.tools.export.fmu import archive, controller, plant
+from ato_hil.tools.export.fmu import archive, controller, plant, train
 from ato_hil.tools.session import fmus, session
 from ato_hil.tools.session.options import Options, SessionError
 from ato_hil.tools.session.processes import RunError
@@ -110,10 +110,44 @@ def test_what_is_no_such_fmu_is_one_line(place, tmp_path, made):
     (tmp_path / "text.fmu").write_text("text")
     with pytest.raises(FmuError, match=r"text\.fmu: no FMU: "):
         made(controller_fmu=tmp_path / "text.fmu")
-    for name in ("train.fmu", "plain-train.fmu"):
-        with pytest.raises(FmuError, match=r"train\.fmu: (the FMU of a plant|RUN_CTRL\.fresh is)"):
-            made(controller_fmu=place / name)
     assert not (tmp_path / "fmu").exists()  # the folder of the session
+
+
+def renamed(place, tmp_path, name, old, new):
+    """An FMU with another text in its description."""
+    other = tmp_path / name
+    with zipfile.ZipFile(place / name) as archive, zipfile.ZipFile(other, "w") as changed:
+        for member in archive.namelist():
+            content = archive.read(member)
+            if member == "modelDescription.xml":
+                assert old in content
+                content = content.replace(old, new)
+            changed.writestr(member, content)
+    return other
+
+
+@pytest.mark.parametrize("form", ["", "plain-"])
+@pytest.mark.parametrize(("part", "name"), [("controller", "train.fmu"), ("plant", "ato.fmu")])
+def test_one_in_the_place_of_the_other_says_which_it_is(place, tmp_path, made, form, part, name):
+    is_part = {"train.fmu": "plant", "ato.fmu": "controller"}[name]
+    with pytest.raises(
+        FmuError, match=rf"{name}: '.+', the FMU of a {is_part}, expected that of a {part}$"
+    ):
+        made(**{f"{part}_fmu": place / (form + name)})
+    # As somebody else would have made it.
+    if form:
+        other = renamed(place, tmp_path, form + name, f"{is_part}, sc".encode(), b"1.0, sc")
+        with pytest.raises(
+            FmuError, match=rf"{name}: '.+', expected the FMU of a {part}: \S+ is of causality"
+        ):
+            made(**{f"{part}_fmu": other})
+
+
+def test_the_bare_train_is_no_plant(place, tmp_path, made):
+    loaded = load(str(place / "short.toml"))
+    archive.write(train.unpacked(loaded, None, "none"), tmp_path / "bare.fmu")
+    with pytest.raises(FmuError, match=r"'Bare train, short', the FMU of a train, expected that"):
+        made(plant_fmu=tmp_path / "bare.fmu")
 
 
 def test_a_binary_for_another_machine_is_one_line(place, tmp_path, made):
