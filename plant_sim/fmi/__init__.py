@@ -40,6 +40,7 @@ class Wanted(msgspec.Struct, frozen=True):
     bus_outputs: list[Port] | None = None  # instead of inputs and outputs if it is a CAN node
     start: dict[str, float] = {}  # parameters by name
     scenario: str = ""  # digest that one of ours has to be made for, if that matters
+    law: str = ""  # likewise
     keeps: bool = False  # requests since the last reset, so that they can be verified
 
 

@@ -37,7 +37,7 @@ from ato_hil.plant_sim.fmi import (
 )
 from ato_hil.plant_sim.fmi.archive import FmuError
 
-MADE_FOR = re.compile(r"(\w+), scenario (\w+)")  # how an FMU of ours says it
+MADE_FOR = re.compile(r"(\w+), scenario (\w+)(?:, law ([^,]+))?")  # how an FMU of ours says it
 TRANSCEIVER = "org.fmi-ls-bus.transceiver"
 ITERATIONS_MAX = 50  # of one event
 TEXT_MOST = 400  # characters of an error: names and texts in it are of others
@@ -397,13 +397,15 @@ def refuse_another(wanted: Wanted, description: Any) -> None:
     found = MADE_FOR.match(description.version or "")
     if found is None:
         return
-    part, scenario = found.groups()
+    part, scenario, law = found.groups()
     if wanted.part and part != wanted.part:
         raise FmuError(
             f"{description.modelName!r}, the FMU of a {part}, expected that of a {wanted.part}"
         )
     if wanted.scenario and scenario != wanted.scenario:
         raise FmuError(f"made for scenario {scenario}, expected {wanted.scenario}")
+    if wanted.law and law and law != wanted.law:
+        raise FmuError(f"made for law {law}, expected {wanted.law}")
 
 
 def refuse_without_binary(file: str, names: list[str], fmi: str, description: Any) -> None:

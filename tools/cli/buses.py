@@ -17,7 +17,7 @@ from ato_hil.tools.cli.console import (
     say,
     working,
 )
-from ato_hil.tools.cli.options import Channel, LawName, Recording, ScenarioName
+from ato_hil.tools.cli.options import Channel, LawName, Recording, ScenarioName, refuse
 from ato_hil.tools.cli.output import console
 from ato_hil.tools.cli.tables import Column, Row, show
 
@@ -181,6 +181,7 @@ def _print_bus_report(found: BusReport) -> None:
 
 
 def bench(
+    context: typer.Context,
     bus: Annotated[
         list[str] | None,
         typer.Option(help="Bus to measure, may be repeated; the first is that of the HIL figure."),
@@ -206,6 +207,10 @@ def bench(
     from ato_hil.tools.bench import bench as rates
     from ato_hil.tools.bench import pingpong
 
+    if parts:
+        refuse(context, "has no effect with --parts", "bus", "sessions", "campaign")
+    if campaign is not None:
+        refuse(context, "has no effect with --campaign", "bus", "sessions")
     if parts:
         _print_parts(parts)
         return

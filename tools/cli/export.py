@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from ato_hil.tools.cli.console import EXIT_BAD_INPUT, fail, one_line_for_bad_input, say
-from ato_hil.tools.cli.options import DEFAULT_BOARD, BoardName
+from ato_hil.tools.cli.console import one_line_for_bad_input, say
+from ato_hil.tools.cli.options import DEFAULT_BOARD, BoardName, refuse
 from ato_hil.tools.session import boards
 
 app = typer.Typer(help="The firmware for other tools and targets.", no_args_is_help=True)
@@ -68,6 +68,7 @@ class FmuBus(StrEnum):
 
 
 def fmu_command(
+    context: typer.Context,
     scenario: Annotated[
         str, typer.Argument(help="Name of a scenario (`ato-hil list`) or a .toml file.")
     ],
@@ -93,8 +94,8 @@ def fmu_command(
         from ato_hil.tools.export.fmu import plant as plant_fmu
         from ato_hil.tools.export.fmu import train as train_fmu
 
-        if plant and train:
-            raise fail("--plant has the train in it, so not with --train", EXIT_BAD_INPUT)
+        if train:
+            refuse(context, "has no effect with --train", "plant", "law", "bus")
         part = plant_fmu if plant else train_fmu if train else controller
         made = part.unpacked(load(scenario), law, bus.value)
         missing = archive.write(made, out)

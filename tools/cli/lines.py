@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from ato_hil.tools.cli.console import EXIT_BAD_INPUT, fail, one_line_for_bad_input, say
-from ato_hil.tools.cli.options import ScenarioName
+from ato_hil.tools.cli.options import ScenarioName, refuse
 from ato_hil.tools.cli.output import console
 from ato_hil.tools.cli.tables import Column, Row, show
 
@@ -22,6 +22,7 @@ class Objective(StrEnum):
 
 
 def import_line(
+    context: typer.Context,
     out: Annotated[Path, typer.Option(help="Scenario to write, .toml; it must not exist yet.")],
     train: Annotated[Path, typer.Option(help="TRAIN.json of TTOBench, or a train.toml.")],
     track: Annotated[
@@ -67,6 +68,10 @@ def import_line(
             raise fail(f"--out {out}: expected a name that ends in .toml", EXIT_BAD_INPUT)
         if out.exists():
             raise fail(f"--out {out}: is there already", EXIT_BAD_INPUT)
+        if journey is not None:
+            refuse(context, "has no effect with --journey", "dwell")
+        if objective is Objective.time:
+            refuse(context, "has no effect with --objective time", "times")
         line, source = read.line(track, stops, limits, gradients)
         vehicle = read.train(train)
         line, given, dwells = read.timetable(line, journey, times, dwell)

@@ -16,7 +16,7 @@ from ato_hil.tools.cli.console import (
     say,
     working,
 )
-from ato_hil.tools.cli.options import SEED_MAX, Picture, ScenarioName
+from ato_hil.tools.cli.options import SEED_MAX, Picture, ScenarioName, refuse
 from ato_hil.tools.cli.output import console
 from ato_hil.tools.cli.tables import Column, Row, show
 
@@ -41,6 +41,7 @@ def _cases(outlined: outline.Outline) -> str:
 
 
 def profile(
+    context: typer.Context,
     scenario: ScenarioName,
     run: Annotated[
         int, typer.Option(min=0, help="Run whose timetable to print; 0: as planned.")
@@ -52,6 +53,8 @@ def profile(
     from ato_hil.plant_sim.scenario import at_rate, load
     from ato_hil.plant_sim.world import ceiling_of, timetable_rate
 
+    if not run:
+        refuse(context, "needs --run", "seed")
     with one_line_for_bad_input():
         loaded = load(scenario)
     if run:
@@ -70,6 +73,7 @@ def profile(
 
 
 def view(
+    context: typer.Context,
     folders: Annotated[
         list[Path],
         typer.Argument(
@@ -95,6 +99,10 @@ def view(
     from ato_hil.tools.trace import live_viewer
     from ato_hil.tools.trace import viewer as finished
 
+    if screenshot is None:
+        refuse(context, "needs --screenshot", "tab")
+    else:
+        refuse(context, "has no effect with --screenshot", "web")
     with one_line_for_bad_input(), finished.prepared(folders, law_compare) as trace:
         if screenshot is not None:
             finished.screenshot(trace, screenshot, tab)

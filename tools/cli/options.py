@@ -8,7 +8,22 @@ from typing import Annotated
 
 import typer
 
+from ato_hil.tools.cli.console import EXIT_BAD_INPUT, fail
 from ato_hil.tools.session import boards
+
+
+def given(context: typer.Context, name: str) -> bool:
+    """Whether the option of this parameter stands on the command line."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+def refuse(context: typer.Context, why: str, *names: str) -> None:
+    """Raises typer.Exit for an option of these parameters that stands on the command line, and
+    beside the others has no effect; `why` goes on after its name."""
+    for parameter in context.command.params:
+        if parameter.name in names and given(context, parameter.name):
+            raise fail(f"{parameter.opts[0]} {why}", EXIT_BAD_INPUT)
 
 
 class Mode(StrEnum):

@@ -20,7 +20,7 @@ from ato_hil.tools.cli.console import (
     say,
     working,
 )
-from ato_hil.tools.cli.options import SEED_MAX, Mode, Overwrite
+from ato_hil.tools.cli.options import SEED_MAX, Mode, Overwrite, refuse
 from ato_hil.tools.cli.output import console
 from ato_hil.tools.cli.tables import Column, Row, show
 
@@ -79,6 +79,7 @@ def claims(
 
 
 def verify(
+    context: typer.Context,
     laws: Annotated[list[str] | None, typer.Argument(help="Laws; all by default.")] = None,
     fast: Annotated[bool, typer.Option("--fast", help="Only what takes seconds.")] = False,
     renew_golden: Annotated[
@@ -93,6 +94,10 @@ def verify(
     from ato_hil.controller.registry import law_names
     from ato_hil.tools.verify import identity, table
 
+    if renew_golden:
+        refuse(context, "has no effect with --renew-golden", "fast", "prove")
+    if prove:
+        refuse(context, "has no effect with --prove", "fast")
     rows = []
     with one_line_for_bad_input():
         if renew_golden:
@@ -129,6 +134,7 @@ def _print_rows(rows: list[Check]) -> None:
 
 
 def threats(
+    context: typer.Context,
     frames: Annotated[
         int | None,
         typer.Option(min=1, help="At least so many; a million in SIL, a hundred thousand in HIL."),
@@ -153,6 +159,8 @@ def threats(
 
     if mode not in (Mode.sil, Mode.hil):
         raise fail(f"threats: mode is {mode.value}, expected sil or hil", EXIT_BAD_INPUT)
+    if mode is not Mode.hil:
+        refuse(context, f"needs mode hil, this is {mode.value}", "bus")
     least = frames or (1_000_000 if mode is Mode.sil else 100_000)
     say(
         f"{least:,} frames or more, and {RESIDUAL_FRAMES:,} corrupt ones: this takes minutes", "dim"

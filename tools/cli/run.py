@@ -13,7 +13,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ato_hil.tools.cli import places
 from ato_hil.tools.cli.console import (
-    EXIT_BAD_INPUT,
     EXIT_ENDED_EARLY,
     EXIT_INTERRUPTED,
     EXIT_NOT_AS_EXPECTED,
@@ -38,6 +37,8 @@ from ato_hil.tools.cli.options import (
     ToStop,
     Trace,
     Viewer,
+    given,
+    refuse,
 )
 from ato_hil.tools.cli.output import console
 from ato_hil.tools.cli.tables import Column, Row, headings, show
@@ -172,6 +173,7 @@ def _print_table(screen: Screen) -> None:
 
 
 def run(
+    context: typer.Context,
     scenario: Annotated[
         str, typer.Argument(help="Name of a scenario (`ato-hil list`) or a .toml file.")
     ],
@@ -183,7 +185,8 @@ def run(
         Mode,
         typer.Option(
             help="hil: processes on a bus; sil: one compiled loop; mil: interpreted, checked;"
-            " pil: on an emulated microcontroller; fmu: with the FMUs that are named."
+            " pil: on an emulated microcontroller; fmu: with the FMUs that are"
+            " named, and the default then."
         ),
     ] = Mode.hil,
     bus: Annotated[
@@ -283,14 +286,11 @@ def run(
             scenario = with_part(scenario, from_stop, to_stop)
         expected = [parse(text) for text in expect or ()]
         nodes = tuple(dict.fromkeys(node.value for node in external or ()))
-        if controller_fmu is not None or plant_fmu is not None:
-            if mode not in (Mode.hil, Mode.fmu):
-                raise fail(f"an FMU needs mode fmu, this is {mode.value}", EXIT_BAD_INPUT)
+        if (controller_fmu or plant_fmu) and not given(context, "mode"):
             mode = Mode.fmu
+        _refuse_what_has_no_effect(context, mode)
         viewer = None
         if view is not None:
-            if no_trace:
-                raise fail("--view shows the trace, so not with --no-trace", EXIT_BAD_INPUT)
             viewer = stack.enter_context(LiveView(view.value))
         if mode is Mode.pil and firmware is None:
             from ato_hil.tools.export import image
@@ -336,6 +336,26 @@ def run(
         _wait_for(viewer)
         if failure is not None:
             raise failure
+
+
+def _refuse_what_has_no_effect(context: typer.Context, mode: Mode) -> None:
+    """Raises typer.Exit for an option that beside others has no effect."""
+    asked = context.params
+    this = f", this is {mode.value}"
+    if mode is not Mode.hil:
+        refuse(context, f"needs mode hil{this}", "bus")
+    if mode is not Mode.pil:
+        refuse(context, f"needs mode pil{this}", "board")
+    if mode is not Mode.fmu:
+        refuse(context, f"needs mode fmu{this}", "controller_fmu", "plant_fmu")
+    if asked["pace"] is not Pace.realtime:
+        refuse(context, "needs --pace realtime", "spin_us")
+    if asked["no_trace"]:
+        refuse(context, "has no effect with --no-trace", "view", "trace", "trace_mb")
+    if asked["view"] is not None:
+        refuse(context, "has no effect with --view", "trace_mb")
+    if asked["trace"] is Trace.full:
+        refuse(context, "has no effect with --trace full", "trace_mb")
 
 
 def _name(scenario: str, law: str | None, mode: Mode, external: tuple[str, ...]) -> str:

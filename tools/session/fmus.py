@@ -30,6 +30,7 @@ from ato_hil.can_dbc.codec import (
 from ato_hil.can_dbc.inbox import fresh_frames, waiting_frames
 from ato_hil.controller import node as controller_node
 from ato_hil.controller.interface import fault_names
+from ato_hil.controller.registry import law_label
 from ato_hil.plant_sim import plant
 from ato_hil.plant_sim.fmi import Port, Wanted, process
 from ato_hil.plant_sim.fmi.process import Fmu, FmuError
@@ -212,11 +213,11 @@ def fill(boxes: Any, frames: Iterable[Frame]) -> None:
         box["payload"], box["fresh"] = payload, 1
 
 
-def controller(file: Path, loaded: Loaded, train: int, stack: ExitStack) -> Controller:
+def controller(file: Path, loaded: Loaded, law: str, train: int, stack: ExitStack) -> Controller:
     """The controller of a train; closing `stack` ends it. Raises FmuError."""
     received, sent = onboard.frames(loaded)
     start = {"train": float(train)} if loaded.trains > 1 else {}
-    fmu = _opened(file, "controller", loaded, received, sent, [], start, stack)
+    fmu = _opened(file, "controller", loaded, received, sent, [], start, stack, law_label(law))
     return Controller(_node(fmu, received, sent))
 
 
@@ -240,6 +241,7 @@ def _opened(
     more: Sequence[str],
     start: dict[str, float],
     stack: ExitStack,
+    law: str = "",
 ) -> Fmu:
     inputs = [Port(f"{name}.fresh") for name in received]
     for message in MESSAGES:
@@ -258,6 +260,7 @@ def _opened(
         [Port(name) for name in more],
         start,
         scenario=loaded.digest,
+        law=law,
     )
     return process.start(wanted, stack)
 

@@ -145,7 +145,7 @@ class Foreign(InProcess):
             controllers: list[Any] = [fmus.OurController(each) for each in ours]
             if options.controller_fmu is not None:
                 controllers = [
-                    fmus.controller(options.controller_fmu, setup.loaded, train, stack)
+                    fmus.controller(options.controller_fmu, setup.loaded, setup.law, train, stack)
                     for train in range(len(ours))
                 ]
             watch = self.listener.progress

@@ -205,7 +205,7 @@ def check(options: Options, held: ExitStack) -> Setup:
             raise SessionError(f"{loaded.path}: a train that is an FMU needs another mode than mil")
         foreign.Host(loaded.scenario.train, loaded.path.parent, loaded.scenario.period_s)
     if options.mode == "fmu":
-        _try_fmus(options, loaded, runs)
+        _try_fmus(options, loaded, law, runs)
     if options.record is not None:
         can_logs.check_target(options.record)
         held.enter_context(locks.file_held(options.record))
@@ -244,11 +244,11 @@ def _refuse_what_fmus_have_not(options: Options, trains: list[Loaded]) -> None:
             raise SessionError(f"{options.controller_fmu}: a controller FMU takes no {what}")
 
 
-def _try_fmus(options: Options, loaded: Loaded, runs: range) -> None:
+def _try_fmus(options: Options, loaded: Loaded, law: str, runs: range) -> None:
     """Raises FmuError for one that is not as it has to be."""
     with ExitStack() as opened:
         if options.controller_fmu is not None:
-            fmus.controller(options.controller_fmu, loaded, 0, opened)
+            fmus.controller(options.controller_fmu, loaded, law, 0, opened)
         if options.plant_fmu is not None:
             fmus.world(options.plant_fmu, loaded, runs, options.seed, opened)
 

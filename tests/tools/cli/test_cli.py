@@ -231,3 +231,49 @@ def test_the_claims_of_a_paper_come_out_as_found(
     assert all(row["holds"] == row["expected"] for row in rows)
     assert any(not row["holds"] for row in rows)
     assert all(math.isfinite(row["measured"]) for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        (
+            "run subway --controller-fmu x --mode hil",
+            "--controller-fmu needs mode fmu, this is hil",
+        ),
+        ("run subway --mode sil --plant-fmu x", "--plant-fmu needs mode fmu, this is sil"),
+        ("run subway --plant-fmu x --bus auto", "--bus needs mode hil, this is fmu"),
+        ("run subway --mode sil --bus hub", "--bus needs mode hil, this is sil"),
+        ("run subway --board microbit", "--board needs mode pil, this is hil"),
+        ("run subway --spin-us 3", "--spin-us needs --pace realtime"),
+        ("run subway --no-trace --trace auto", "--trace has no effect with --no-trace"),
+        ("run subway --no-trace --view web", "--view has no effect with --no-trace"),
+        ("run subway --trace full --trace-mb 3", "--trace-mb has no effect with --trace full"),
+        ("run subway --view web --trace-mb 3", "--trace-mb has no effect with --view"),
+        ("verify --renew-golden --prove", "--prove has no effect with --renew-golden"),
+        ("verify --prove --fast", "--fast has no effect with --prove"),
+        ("threats --bus hub", "--bus needs mode hil, this is sil"),
+        ("bench --parts subway --no-sessions", "--sessions has no effect with --parts"),
+        ("bench --campaign 20 --bus hub", "--bus has no effect with --campaign"),
+        ("export fmu subway --out x.fmu --train --law pid", "--law has no effect with --train"),
+        ("view runs --tab X", "--tab needs --screenshot"),
+        ("view runs --web --screenshot x.png", "--web has no effect with --screenshot"),
+        ("profile subway --seed 3", "--seed needs --run"),
+        (
+            "import x.json --train y.json --out z.toml --journey j.json --dwell 3",
+            "--dwell has no effect with --journey",
+        ),
+        (
+            "import x.json --train y.json --out z.toml --objective time --times 3",
+            "--times has no effect with --objective time",
+        ),
+    ],
+)
+def test_an_option_that_has_no_effect_beside_others_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, says: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = io.StringIO()
+    monkeypatch.setattr(console, "errors", PlainConsole(width=40, file=said))
+    result = CliRunner().invoke(main.app, command.split())
+    assert (result.exit_code, said.getvalue()) == (1, f"ato-hil: {says}\n")
+    assert list(tmp_path.iterdir()) == []

@@ -38,9 +38,9 @@ def place(tmp_path_factory, short_text):
 
 @pytest.fixture
 def made(place, tmp_path, silent):
-    def run(mode="fmu", scenario=place / "short.toml", runs=2, **more):
+    def run(mode="fmu", scenario=place / "short.toml", runs=2, law=None, **more):
         options = Options(
-            *(str(scenario), None, runs, mode, "none", 3, tmp_path / mode, None),
+            *(str(scenario), law, runs, mode, "none", 3, tmp_path / mode, None),
             trace=False,
             **more,
         )
@@ -99,9 +99,11 @@ def test_what_is_no_operation_names_the_fmu(operation):
         fmus.frames_of(whole + operation, "odd.fmu")
 
 
-def test_another_scenario_is_refused(place, made):
+def test_another_scenario_or_law_is_refused(place, made):
     with pytest.raises(FmuError, match=r"ato\.fmu: made for scenario \w+, expected \w+$"):
         made(scenario="subway-fast", controller_fmu=place / "ato.fmu")
+    with pytest.raises(FmuError, match=r"ato\.fmu: made for law cailc, expected pid$"):
+        made(law="pid", controller_fmu=place / "ato.fmu")
 
 
 def test_what_is_no_such_fmu_is_one_line(place, tmp_path, made):

@@ -27,8 +27,8 @@ def unpacked(loaded: Loaded, law: str | None, bus: str = "can") -> Unpacked:
         title=f"ATO {law_label(law)}, {loaded.name}",
         text=f"Automatic train operation: law {law_label(law)}, scenario {loaded.name}",
         version=importlib.metadata.version("ato-hil"),
-        content=f"controller, scenario {loaded.digest}, sources {library.source_digest(law)},"
-        f" bus {bus}",
+        content=f"controller, scenario {loaded.digest}, law {law_label(law)},"
+        f" sources {library.source_digest(law)}, bus {bus}",
         period_s=loaded.scenario.period_s,
         stop_s=round((loaded.ticks + 2) * loaded.scenario.period_s, 9),
     )
