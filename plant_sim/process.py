@@ -410,11 +410,12 @@ def main() -> int:
         return 1
     refused = []
     spin_ns = None
+    hubs = [bus.hub_pid for bus in buses if hasattr(bus, "hub_pid")]
     if arguments.realtime:
         spin_ns = 1000 * arguments.spin_us
         here.state["node"]["pace"] = plant.REAL_TIME
-        refused = pace.prepare(bus.hub_pid for bus in buses if hasattr(bus, "hub_pid"))
-    tell("ready", refused=refused)
+        refused = pace.prepare(hubs)
+    tell("ready", refused=refused, hubs=hubs)
     try:
         while commands.empty() and not stop.requested:
             time.sleep(0.005)

@@ -47,6 +47,7 @@ class Fmu:
 
     def __init__(self, file: str, process: subprocess.Popen[bytes], line: socket.socket) -> None:
         self.file, self._process, self._line = file, process, line
+        self.pid = process.pid
         self.opened = Opened("", [], [], [], [], False, False)
         self.inputs: list[str] = []  # names, in the order of a row
         self.outputs: list[str] = []

@@ -1,5 +1,5 @@
 """The peer of HIL: the frames of the same run, there and back between two processes by python-can's
-own send and recv, without any control."""
+own send and recv, without any control, on the cores that HIL has."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ from ato_hil.can_dbc.bus import BusError, choose_bus, open_bus
 from ato_hil.can_dbc.child import python
 from ato_hil.can_dbc.codec import FORCE_CMD, bytes_of
 from ato_hil.can_dbc.faults import senders
+from ato_hil.can_dbc.hub import HubBus
 from ato_hil.plant_sim.scenario import load
 from ato_hil.tools.runs import locks
 from ato_hil.tools.session import in_process
+from ato_hil.tools.session.turns import on_one_core
 
 TIMEOUT_S = 10.0
 NODES = ("controller", "plant")  # whose places on the bus are held
@@ -46,12 +48,14 @@ def rate(bus: str, frames: np.ndarray) -> float:
         try:
             with open_bus(name) as here:
                 child.stdout.readline()
-                started = time.perf_counter()
-                for there, back in ticks:
-                    for message in there:
-                        here.send(message)
-                    _receive(here, back)
-                return len(ticks) / (time.perf_counter() - started)
+                hub = [here.hub_pid] if isinstance(here, HubBus) else []
+                with on_one_core([child.pid, *hub], with_this_thread=True):
+                    started = time.perf_counter()
+                    for there, back in ticks:
+                        for message in there:
+                            here.send(message)
+                        _receive(here, back)
+                    return len(ticks) / (time.perf_counter() - started)
         finally:
             child.kill()
             child.communicate()

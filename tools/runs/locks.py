@@ -1,4 +1,5 @@
-"""What only one session may have at a time: an output folder, a memory file, a recording, a bus.
+"""What only one session may have at a time: an output folder, a memory file, a recording, a bus, a
+core to itself.
 
 A lock is the kernel's (flock): it ends with its holder, however that ends, so none is left behind
 that refuses. A folder is locked itself, a file by a FILE.lock beside it, which goes with the lock.
@@ -9,8 +10,8 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import can
@@ -80,14 +81,31 @@ def buses_held(buses: Collection[str], nodes: Collection[str]) -> Iterator[None]
         for bus in buses:
             for node in nodes:
                 name = "".join(c if c.isalnum() or c in "_.-" else "_" for c in f"{bus}-{node}")
-                try:
-                    place = socket_path(name)  # in the folder where nodes meet
-                except (can.CanError, ValueError) as error:
-                    raise LockedError(f"bus {bus!r}: {error}") from None
                 taken = f"bus {bus!r} is taken, it carries other traffic; choose another"
                 text = f"{taken}, e.g. --bus hub:second"
-                stack.enter_context(file_held(place.with_suffix(""), text))
+                stack.enter_context(file_held(_place(name, f"bus {bus!r}"), text))
         yield
+
+
+@contextmanager
+def core_held(cores: Iterable[int]) -> Iterator[int | None]:
+    """Holds the first of some cores that no other session has; None if there is none."""
+    with ExitStack() as stack:
+        held = None
+        for core in cores:
+            with suppress(LockedError):
+                stack.enter_context(file_held(_place(f"core-{core}", f"core {core}")))
+                held = core
+                break
+        yield held
+
+
+def _place(name: str, what: str) -> Path:
+    """A file in the folder where nodes meet; `what` it is for. Raises LockedError."""
+    try:
+        return socket_path(name).with_suffix("")
+    except (can.CanError, ValueError) as error:
+        raise LockedError(f"{what}: {error}") from None
 
 
 def _lock(descriptor: int, what: str) -> None:

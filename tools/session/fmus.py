@@ -39,6 +39,7 @@ from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.frames import FRAME
 from ato_hil.tools.runs.result import Run, Runs
 from ato_hil.tools.session import sil
+from ato_hil.tools.session.turns import on_one_core
 
 TRANSMIT, TRANSMIT_HEAD = 0x10, struct.Struct("<IIIBBH")
 OPERATION = struct.Struct("<II")
@@ -164,6 +165,7 @@ class Controller:
         node.begin()
         self._answer: list[Frame] = []
         self.faults = 0
+        self.processes = [node.fmu.pid]
 
     def send(self, _period: int, boxes: Any) -> None:
         """The fresh mailboxes."""
@@ -186,6 +188,7 @@ class OurController:
 
     def __init__(self, node: controller_node.Controller) -> None:
         self._node = node
+        self.processes: list[int] = []
 
     def send(self, period: int, boxes: Any) -> None:
         """The fresh mailboxes."""
@@ -286,7 +289,8 @@ def run_line(
         began = time.perf_counter()
         if progress:
             progress(number, 0)
-        rows, truths = _one_run(there, controller, number, boxes, answer, progress)
+        with on_one_core([there.fmu.pid, *controller.processes], with_this_thread=True):
+            rows, truths = _one_run(there, controller, number, boxes, answer, progress)
         seconds = time.perf_counter() - began
         if progress:
             progress(number, len(truths))

@@ -37,6 +37,7 @@ from ato_hil.tools.runs.result import Run, Runs
 from ato_hil.tools.session import sil
 from ato_hil.tools.session.boards import Board, BoardError
 from ato_hil.tools.session.processes import RunError
+from ato_hil.tools.session.turns import on_one_core
 
 EMULATOR = "qemu-system-arm"
 PROTOCOL = 1
@@ -89,6 +90,10 @@ class State:
 class Driven(Protocol):
     """A controller outside of the plant's loop: a board, an FMU, or ours."""
 
+    @property
+    def processes(self) -> list[int]:
+        """That it has to itself."""
+
     def send(self, period: int, mailboxes: Any, /) -> None:
         """The fresh mailboxes, for a call of ato_cycle."""
 
@@ -111,6 +116,11 @@ class Target:
         for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
             timeval = struct.pack("@ll", seconds, microseconds)
             line.setsockopt(socket.SOL_SOCKET, option, timeval)
+
+    @property
+    def processes(self) -> list[int]:
+        """The emulator."""
+        return [self.process.pid]
 
     def call(self, kind: str, content: bytes) -> None:
         """Sends a block. Raises RunError if the emulator has ended or takes nothing."""
@@ -307,6 +317,7 @@ def run_line(
     with the tick."""
     here = world.build(loaded, seed)
     made = Runs(members(loaded), law)
+    pids = started[0].processes if len(started) == 1 else []  # several work side by side
     for number in runs:
         if progress:
             progress(number, 0)
@@ -317,7 +328,8 @@ def run_line(
         truth = np.zeros(chance.shape, plant.TRUTH)
         frames = np.empty((len(started), truth.shape[1] * MESSAGE_COUNT), FRAME)
         began = time.perf_counter()
-        counts = _drive(here, started, number, chance, truth, frames, progress)
+        with on_one_core(pids, with_this_thread=True):
+            counts = _drive(here, started, number, chance, truth, frames, progress)
         seconds = time.perf_counter() - began
         _announce(here, started, plant.ENDED, number)
         faults = [fault_names(target.state().faults) for target in started]

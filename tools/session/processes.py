@@ -31,6 +31,7 @@ from ato_hil.controller import store
 from ato_hil.controller.calibration import Calibration
 from ato_hil.tools.session.external_nodes import CONTROLLER, PATIENCE_S, PLANT
 from ato_hil.tools.session.interrupts import Interrupts
+from ato_hil.tools.session.turns import on_one_core
 
 READY_TIMEOUT_S = 300.0  # the first start compiles
 # The plant's own limit while the observer judges a foreign controller, and names what is wrong.
@@ -396,6 +397,10 @@ def run(
         bench.wait_ready()
         for node in bench.nodes.values():
             yield node, node.said["ready"], bench
+        if real_time is None and not external and len(controllers) == 1:
+            hubs: list[int] = leader.said["ready"]["hubs"]
+            pids = [bench.nodes[name].process.pid for name in (PLANT, CONTROLLER)]
+            afterwards.enter_context(on_one_core([*hubs, *pids]))
         bench.leader = leader
         leader.command(command="start")
         leader.heard_s = bench.now_s()  # it was ready long before the others, if they compiled
