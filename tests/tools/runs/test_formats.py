@@ -21,6 +21,7 @@ import pytest
 
 from ato_hil.tools.runs import can_logs
 from ato_hil.tools.runs.can_logs import Recorded, RecordError, Recording
+from ato_hil.tools.runs.formats import common
 from ato_hil.tools.runs.frames import FRAME
 
 IDS = (0x090, 0x080, 0x0B0, 0x0B1, 0x200, 0x7FF)
@@ -140,6 +141,32 @@ def test_a_compressed_file(whole: Path) -> None:
         read_bytes(packed, whole.read_bytes())
     with pytest.raises(RecordError, match=r"is compressed by gzip: its name should end in \.gz"):
         read_bytes(whole, content)
+
+
+LINE = b"(1.0) can0 090#0011223344556677\n"
+
+
+@pytest.mark.parametrize(
+    ("begin", "repeated", "frames"), [(b"", LINE, True), (LINE, b"\n", True), (b"", b"\n", False)]
+)
+def test_what_unpacks_to_far_more_than_a_log_is_not_read_to_its_end(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    begin: bytes,
+    repeated: bytes,
+    frames: bool,
+) -> None:
+    monkeypatch.setattr(common, "UNPACKED_LEAST", 1000)
+    monkeypatch.setattr(common, "PIECE", 1 << 16)
+    size = 4_000_000
+    content = gzip.compress(begin + repeated * (size // len(repeated)))
+    assert len(content) < size // common.UNPACKED_RATIO
+    found = read_or_refusal(tmp_path / "x.log.gz", content)
+    said = found if isinstance(found, str) else found.missing
+    assert said.endswith("its compressed data unpack to more than 100 times their size")
+    assert isinstance(found, str) != frames
+    if isinstance(found, Recorded):
+        assert len(found.words) * len(LINE) < 2 * common.UNPACKED_RATIO * len(content)
 
 
 def test_frames_of_other_kinds_are_counted(tmp_path: Path) -> None:
@@ -494,6 +521,14 @@ def test_what_a_blf_may_hold(tmp_path: Path) -> None:
             assert found.missing == ""
             assert found.words.tolist() == [0x12201F, 0, 0x12201F]
             assert found.left_out == expected
+
+
+def test_containers_that_unpack_to_far_more_than_a_log_are_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(common, "UNPACKED_LEAST", 1000)
+    found = blf(tmp_path / "x.blf", [thing(), thing() * 20_000, thing()])
+    assert found.missing.startswith("damaged after frame 1: its compressed data unpack to more")
 
 
 def test_objects_outside_of_containers_are_read(tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ bytes are those of another kind is refused with the name of that kind.
 from __future__ import annotations
 
 import gzip
+import io
+import os
 import re
 import zlib
 from collections.abc import Callable, Iterator
@@ -100,7 +102,9 @@ def rows_of(path: Path) -> Iterator[Row]:
             if path.suffix.lower() == GZIP:
                 if file.peek(2)[:2] not in (b"", b"\x1f\x8b"):
                     raise Refused("is not compressed by gzip, as its name says")
-                stream = cast(BinaryIO, gzip.GzipFile(fileobj=file))
+                packed = cast(BinaryIO, gzip.GzipFile(fileobj=file))
+                size = os.fstat(file.fileno()).st_size
+                stream = io.BufferedReader(common.Unpacked(packed, size), common.PIECE)
             # peek gives at most what one read gives: enough of a file, and of gzip.
             head = stream.peek(HEAD_BYTES)[:HEAD_BYTES]  # type: ignore[attr-defined]
             if not head:

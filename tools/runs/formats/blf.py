@@ -91,6 +91,7 @@ class _Source:
 
 def _contents(source: _Source) -> Iterator[bytes]:
     """The row of objects, in pieces."""
+    unpacked = 0
     while header := source.take(OBJECT.size):
         if len(header) < OBJECT.size:
             raise CutOff("it ends inside an object")
@@ -104,7 +105,10 @@ def _contents(source: _Source) -> Iterator[bytes]:
             body = source.take(left)
             if len(body) < left:
                 raise CutOff(f"a container of {size} bytes goes beyond the end")
-            yield _unpacked(body)
+            piece = _unpacked(body)
+            unpacked += len(piece)
+            common.check_ratio(unpacked, source.count)
+            yield piece
         else:
             yield header
             while left:

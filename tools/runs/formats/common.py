@@ -11,7 +11,7 @@ import io
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 # Time in the file, s; channel; kind; identifier and mailbox word, which only OURS has.
 Row = tuple[float, str, str, int, int]
@@ -33,6 +33,8 @@ CLIPPED = "clipped by the capture"
 STANDARD_IDS = 0x800
 LINE_CHARACTERS = 1 << 16  # no log has longer lines: 2048 bytes of CAN XL take 4096
 PIECE = 1 << 20
+# A log of equal frames unpacks to some twenty times its size, deflate can pack a thousand times.
+UNPACKED_LEAST, UNPACKED_RATIO = 1 << 26, 100
 
 BYTE_ORDER_MARKS = (
     (b"\xef\xbb\xbf", "utf-8-sig"),
@@ -67,6 +69,30 @@ def take(stream: BinaryIO, count: int) -> bytes:
         pieces.append(piece)
         count -= len(piece)
     return b"".join(pieces)
+
+
+def check_ratio(unpacked: int, packed: int) -> None:
+    """Raises Damaged if so many bytes come from so few that they are no log."""
+    if unpacked > max(UNPACKED_LEAST, UNPACKED_RATIO * packed):
+        raise Damaged(f"its compressed data unpack to more than {UNPACKED_RATIO} times their size")
+
+
+class Unpacked(io.RawIOBase):
+    """What a stream unpacks, of `packed` bytes. Reading raises Damaged if it is far more."""
+
+    def __init__(self, stream: BinaryIO, packed: int) -> None:
+        self._stream, self._packed, self._count = stream, packed, 0
+
+    def readable(self) -> bool:
+        """Yes."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """As of every raw stream."""
+        count: int = self._stream.readinto(buffer)  # type: ignore[attr-defined]
+        self._count += count
+        check_ratio(self._count, self._packed)
+        return count
 
 
 def encoding_of(head: bytes) -> str:
