@@ -292,7 +292,11 @@ def crawl(bounds: np.void, mesh: Mesh) -> NDArray[np.float64]:
             1.0, 1.0, SMOOTH,
         ):  # fmt: skip
             return w
-    raise Infeasible("no run keeps the limits: a gradient is too steep for the train")
+    at = x[int(np.argmax(np.abs(mesh.gradient_m_s2).round(6)))]
+    raise Infeasible(
+        "no run keeps the limits: a gradient is too steep for the train, the steepest is"
+        f" {at:.0f} m from its start"
+    )
 
 
 def _cube_root(values: NDArray[np.float64]) -> NDArray[np.float64]:

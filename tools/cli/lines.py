@@ -72,18 +72,20 @@ def import_line(
             refuse(context, "has no effect with --journey", "dwell")
         if objective is Objective.time:
             refuse(context, "has no effect with --objective time", "times")
+        make.check_law(law)
         line, source = read.line(track, stops, limits, gradients)
         vehicle = read.train(train)
         line, given, dwells = read.timetable(line, journey, times, dwell)
         last = len(line.stops_m) if to_stop is None else to_stop
         read.check_stops(line, from_stop, last)
         first, last = from_stop - 1, last - 1
-        if objective is Objective.time:
-            run = make.Run(first, last, None, make.whole(dwells[first : last - 1]))
-        else:
-            run = make.timed(line, vehicle, first, last, given, dwells)
-        text = make.scenario_text(line, vehicle, run, law, objective.value, source)
-        make.check(out, text)
+        with make.of_files(f"{source}, {train.name}"):
+            if objective is Objective.time:
+                run = make.Run(first, last, None, make.whole(dwells[first : last - 1]))
+            else:
+                run = make.timed(line, vehicle, first, last, given, dwells)
+            text = make.scenario_text(line, vehicle, run, law, objective.value, source)
+            make.check(text)
         make.write(out, text)
     length_m = line.stops_m[last] - line.stops_m[first]
     times_s = run.times_s

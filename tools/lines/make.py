@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -81,14 +82,28 @@ def _curve(c: float) -> float:
     return 0.5 * c / (1 - 30 * c) if c <= 1 / 300 else 0.65 * c / (1 - 55 * c)
 
 
-def scenario_text(line: Line, train: Train, run: Run, law: str, objective: str, source: str) -> str:
-    """The scenario. Raises LineError for a law without a rule or a run that the file cannot say."""
+@contextmanager
+def of_files(names: str) -> Iterator[None]:
+    """Raises LineError that names the files for what a line and a train cannot be together."""
+    try:
+        yield
+    except (PlanError, LineError) as error:
+        raise LineError(f"{names}: {error}") from None
+
+
+def check_law(law: str) -> None:
+    """Raises LineError for a law without a rule for its gains."""
     if law not in gains.LAWS:
         raise LineError(f"law {law!r}: expected one of {', '.join(gains.LAWS)}")
+
+
+def scenario_text(line: Line, train: Train, run: Run, law: str, objective: str, source: str) -> str:
+    """The scenario; `law` is one of gains.LAWS. Raises LineError for a run or a train that it
+    cannot have, without the names of the files."""
     start, end = line.stops_m[run.first], line.stops_m[run.last]
     if end - start > 65000:
         raise LineError(
-            f"{line.name}: {end - start:g} m from stop {run.first + 1} to stop {run.last + 1},"
+            f"{end - start:g} m from stop {run.first + 1} to stop {run.last + 1},"
             " expected up to 65000 m, what a position of the firmware holds: import it in parts,"
             " with --from and --to"
         )
@@ -102,7 +117,7 @@ def scenario_text(line: Line, train: Train, run: Run, law: str, objective: str, 
             brake_n = min(brake_n, brake_w / train.max_speed_m_s)
         brake_n, brake_w = brake_n + friction_n, None
     if not brake_n:
-        raise LineError(f"{train.name}: no brake, expected a largest braking force")
+        raise LineError("a train without a brake, expected a largest braking force")
     largest_n = min(max(train.traction_n, brake_n), LARGEST_COMMAND_N, LARGEST_M_S2 * inertia_kg)
     brake_n = min(brake_n, largest_n)
     acceleration = min(train.max_acceleration_m_s2 or COMFORT_M_S2, COMFORT_M_S2)
@@ -313,12 +328,9 @@ def _from_start(
     return result
 
 
-def check(path: Path, text: str) -> None:
-    """Raises LineError, in the name of the file to be, if the scenario would be refused."""
-    try:
-        planned(_scenario(text))
-    except (PlanError, LineError) as error:
-        raise LineError(f"{path}: not written: {error}") from None
+def check(text: str) -> None:
+    """Raises PlanError or LineError if the scenario would be refused."""
+    planned(_scenario(text))
 
 
 def _scenario(text: str) -> Scenario:

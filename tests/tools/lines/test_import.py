@@ -373,6 +373,20 @@ def test_a_wrong_option_is_one_line_and_no_file(folder, options, message):
     assert not out.exists()
 
 
+@pytest.mark.parametrize("options", [[], ["--times", "62,80"], ["--objective", "time"]])
+def test_what_line_and_train_cannot_do_names_their_files(folder, options):
+    content = json.loads((folder / "track.json").read_text())
+    content["gradients"] = {
+        "units": {"position": "m", "slope": "permil"}, "values": [[0.0, 0.0], [300.0, 150.0]],
+    }  # fmt: skip
+    (folder / "track.json").write_text(json.dumps(content))
+    out, result = _import(folder, *options)
+    said = " ".join(result.output.split())
+    assert said.startswith("ato-hil: track.json, train.json: stop 1 to 2 (0 m): no run keeps the")
+    assert "a gradient is too steep for the train, the steepest is 3" in said
+    assert (result.exit_code, out.exists()) == (1, False)
+
+
 def test_a_file_that_is_there_is_not_overwritten(folder):
     (folder / "made.toml").write_text("mine")
     out, result = _import(folder, "--times", "62")
