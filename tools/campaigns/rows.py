@@ -1,5 +1,5 @@
-"""The rows of a campaign, one a run: made by workers as Parquet, kept in parts as they come, and at
-the end in one file in the order of the sessions.
+"""The rows of a campaign, one a run: made by workers in Arrow's format, kept in parts as they come,
+and at the end in one Parquet file in the order of the sessions.
 
 A part is written whole or not at all. What it belongs to is in its metadata, so that rows of
 another campaign are never taken for those of this one.
@@ -8,7 +8,6 @@ another campaign are never taken for those of this one.
 from __future__ import annotations
 
 import hashlib
-import io
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import pyarrow.parquet as pq
 from ato_hil.tools.runs.files import write_bytes
 
 PARTS, ROWS = "parts", "rows.parquet"
+SUFFIX = ".arrow"  # of a part: few rows, which Parquet would take longer to write than to make
 GROUP_ROWS = 20_000  # of the file at the end, at once in memory
 # Of every row, before and behind what varies and the metrics.
 FIRST = {"session": pa.int64(), "run": pa.int64(), "law": pa.string(), "seed": pa.int64()}
@@ -30,15 +30,22 @@ _MARK = b"ato-hil campaign"
 
 
 def encoded(rows: list[dict[str, Any]], mark: str) -> bytes:
-    """Rows with the keys of FIRST and LAST, and others between, as the Parquet file of a part."""
+    """Rows with the keys of FIRST and LAST, and others between, as the Arrow file of a part."""
     types = {**FIRST, **LAST}
     between = dict.fromkeys(key for row in rows for key in row if key not in types)
     columns = [*FIRST, *between, *LAST]
     arrays = [pa.array([row.get(name) for row in rows], types.get(name)) for name in columns]
     table = pa.table(dict(zip(columns, arrays, strict=True)))
-    stream = io.BytesIO()
-    pq.write_table(table.replace_schema_metadata({_MARK: mark}), stream)
-    return stream.getvalue()
+    table = table.replace_schema_metadata({_MARK: mark})
+    stream = pa.BufferOutputStream()
+    with pa.ipc.new_file(stream, table.schema) as writer:
+        writer.write_table(table)
+    return bytes(stream.getvalue().to_pybytes())
+
+
+def decoded(part: bytes) -> pa.ipc.RecordBatchFileReader:
+    """A part, to read. Raises ArrowInvalid if it is damaged."""
+    return pa.ipc.open_file(part)
 
 
 def keep(folder: Path, batch: int, part: bytes) -> None:
@@ -47,7 +54,7 @@ def keep(folder: Path, batch: int, part: bytes) -> None:
 
 
 def _part(folder: Path, batch: int) -> Path:
-    return folder / PARTS / f"{batch:07d}.parquet"
+    return folder / PARTS / f"{batch:07d}{SUFFIX}"
 
 
 def kept(folder: Path, mark: str) -> set[int]:
@@ -55,7 +62,7 @@ def kept(folder: Path, mark: str) -> set[int]:
     ForeignRowsError for parts of another campaign."""
     found = set()
     for path in sorted((folder / PARTS).glob("*")):
-        theirs = _mark_of(path)
+        theirs = _mark_of_part(path)
         if theirs is None:
             path.unlink()
         elif theirs != mark:
@@ -67,12 +74,12 @@ def kept(folder: Path, mark: str) -> set[int]:
 
 def count(folder: Path, batch: int) -> int:
     """Rows of a part."""
-    return int(pq.read_metadata(_part(folder, batch)).num_rows)
+    return len(_read(_part(folder, batch)).read_all())
 
 
 def metrics_of_part(folder: Path, batch: int, varied: Collection[str]) -> list[str]:
     """Names of the numbers of its runs; none if no run was made."""
-    return metrics(pq.read_schema(_part(folder, batch)), varied)
+    return metrics(_read(_part(folder, batch)).schema, varied)
 
 
 def metrics(schema: pa.Schema, varied: Collection[str]) -> list[str]:
@@ -98,25 +105,36 @@ class ForeignRowsError(ValueError):
 def is_whole(folder: Path, mark: str) -> bool:
     """Whether all rows of the campaign are in one file."""
     path = folder / ROWS
-    return path.is_file() and not (folder / PARTS).is_dir() and _mark_of(path) == mark
-
-
-def _mark_of(path: Path) -> str | None:
-    """What the rows of a file belong to; None for a file that is damaged or no rows."""
+    if not path.is_file() or (folder / PARTS).is_dir():
+        return False
     try:
-        metadata = pq.read_schema(path).metadata or {}
+        return _mark_in(pq.read_schema(path)) == mark
+    except (OSError, pa.ArrowInvalid):
+        return False
+
+
+def _mark_of_part(path: Path) -> str | None:
+    """What the rows of a part belong to; None for a file that is damaged or no part."""
+    try:
+        return _mark_in(_read(path).schema) if path.suffix == SUFFIX else None
     except (OSError, pa.ArrowInvalid):
         return None
-    mark = metadata.get(_MARK)
-    return None if mark is None or path.suffix != ".parquet" else mark.decode()
+
+
+def _mark_in(schema: pa.Schema) -> str | None:
+    mark = (schema.metadata or {}).get(_MARK)
+    return None if mark is None else mark.decode()
+
+
+def _read(path: Path) -> pa.ipc.RecordBatchFileReader:
+    return decoded(path.read_bytes())
 
 
 def merge(folder: Path) -> int:
     """Writes ROWS of all parts; returns how many rows there are. Raises OSError."""
-    paths = sorted((folder / PARTS).glob("*.parquet"))
-    schema = pa.unify_schemas(
-        [pq.read_schema(path) for path in paths], promote_options="permissive"
-    )
+    paths = sorted((folder / PARTS).glob(f"*{SUFFIX}"))
+    schemas = dict.fromkeys(_read(path).schema for path in paths)  # a few, of many parts
+    schema = pa.unify_schemas(list(schemas), promote_options="permissive")
     ends = [schema.get_field_index(name) for name in LAST]
     order = [i for i in range(len(schema)) if i not in ends] + ends
     schema = pa.schema([_known(schema.field(i)) for i in order], metadata=schema.metadata)
@@ -125,14 +143,14 @@ def merge(folder: Path) -> int:
     with pq.ParquetWriter(temporary, schema) as writer:
         waiting: list[pa.Table] = []
         for path in paths:
-            table = pq.read_table(path)
+            table = _read(path).read_all()
             total += len(table)
-            waiting.append(_as(table, schema))
+            waiting.append(table)
             if sum(map(len, waiting)) >= GROUP_ROWS:
-                writer.write_table(pa.concat_tables(waiting))
+                writer.write_table(_as(waiting, schema))
                 waiting = []
         if waiting:
-            writer.write_table(pa.concat_tables(waiting))
+            writer.write_table(_as(waiting, schema))
     temporary.replace(folder / ROWS)
     return total
 
@@ -142,8 +160,9 @@ def _known(field: pa.Field) -> pa.Field:
     return field.with_type(pa.float64()) if pa.types.is_null(field.type) else field
 
 
-def _as(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    """With the columns of a schema; what is not there is empty."""
+def _as(tables: list[pa.Table], schema: pa.Schema) -> pa.Table:
+    """One behind the other, with the columns of a schema; what is not there is empty."""
+    table = pa.concat_tables(tables, promote_options="permissive")
     columns = [
         table[field.name].cast(field.type)
         if field.name in table.column_names
