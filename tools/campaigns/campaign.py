@@ -314,7 +314,9 @@ def measure(batch: Batch) -> Made:
         about = {"session": number, "law": law, "seed": seed, "faults_file": plan}
         about |= {key: _plain(value) for key, value in values.items()}
         try:
-            rows += ({**about, **_row(run)} for run in job.runs(here(asked, folder, batch.files)))
+            made = job.runs(here(asked, folder, batch.files))
+            # No run is held while the next is made, which takes its memory.
+            rows += ({**about, **row} for row in map(_row, made))
         except InputError as error:
             text = str(error).replace(f"{folder}/", "")
             rows.append({**about, "error": text, "cut": "", "digest": "", "faults": []})
@@ -329,10 +331,11 @@ def _row(run: Run) -> dict[str, Any]:
     ended |= {"seconds": run.seconds}
     if run.cut:
         return {**ended, "faults": list(run.faults[0])}
-    row = {key: value for key, value in run.row.items() if not isinstance(value, dict | list)}
+    told = run.row
+    row = {key: value for key, value in told.items() if not isinstance(value, dict | list)}
     for key in LEFT_OUT:
         row.pop(key, None)
-    return {**row, **ended, "faults": run.row["faults"]}
+    return {**row, **ended, "faults": told["faults"]}
 
 
 def _plain(value: Any) -> Any:

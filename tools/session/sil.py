@@ -139,9 +139,10 @@ def run_line(
     # Compiles, or loads what was compiled before.
     kinds = (plant.CHANCE, plant.TRUTH, FRAME)
     drive(0, *(rows(np.zeros((trains, 0), kind)) for kind in kinds))
-    for number in runs:
-        if progress:
-            progress(number, 0)
+
+    def one() -> Run:
+        """Run `number`. Nothing here holds it: the next takes its memory if the caller has done
+        with it."""
         here.prepare(number)
         _announce(here, nodes, plant.ARMED, number)
         here.begin(here.params, here.state)
@@ -158,7 +159,12 @@ def run_line(
         if progress:
             progress(number, ticks)
         sent = [of_train[:count] for of_train, count in zip(frames, counts, strict=True)]
-        yield made.add(number, sent, list(truth), faults, seconds)
+        return made.add(number, sent, list(truth), faults, seconds)
+
+    for number in runs:
+        if progress:
+            progress(number, 0)
+        yield one()
 
 
 def _watched(sense: Any, progress: Callable[[int], None]) -> Any:

@@ -12,6 +12,7 @@ import sys
 import tempfile
 import time
 import tracemalloc
+import weakref
 from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import Any
@@ -25,11 +26,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ato_hil.can_dbc.errors import InputError
+from ato_hil.plant_sim.world import World
 from ato_hil.tools.campaigns import campaign, campaign_file, distributions, rows, worst
 from ato_hil.tools.campaigns.campaign_file import Campaign, CampaignError, read
 from ato_hil.tools.campaigns.varied import Varied
 from ato_hil.tools.cli import campaign as at_console
 from ato_hil.tools.reports import campaign_page
+from ato_hil.tools.runs.result import Run
 from ato_hil.tools.session.spread import Lost, spread
 from ato_hil.tools.trace.writer import TraceError
 
@@ -306,6 +309,25 @@ def test_the_size_of_batches_changes_neither(file: Path, tmp_path: Path, monkeyp
     assert table(tmp_path / "a") == table(tmp_path / "b")
 
 
+def test_a_run_is_gone_before_the_next_is_made(file: Path, monkeypatch: Any) -> None:
+    asked = read(file)
+    made: list[weakref.ref[Any]] = []
+    row, prepare = campaign._row, World.prepare
+
+    def told(run: Run) -> dict[str, Any]:
+        made.extend(map(weakref.ref, (run.frames[0].base, run.truths[0].base)))
+        return row(run)
+
+    def prepared(here: World, number: int) -> None:
+        assert [each() for each in made] == [None] * len(made)
+        prepare(here, number)
+
+    monkeypatch.setattr(campaign, "_row", told)
+    monkeypatch.setattr(World, "prepare", prepared)
+    campaign.measure(campaign.batch(asked, 0, 1, campaign.mark_of(asked)))
+    assert len(made) == 4
+
+
 @pytest.mark.usefixtures("small_batches")
 def test_what_is_interrupted_goes_on(file: Path, tmp_path: Path) -> None:
     file.write_text(PLAIN)
@@ -317,7 +339,7 @@ def test_what_is_interrupted_goes_on(file: Path, tmp_path: Path) -> None:
     parts = sorted((tmp_path / "b" / rows.PARTS).iterdir())
     assert len(parts) == 3
     parts[1].write_bytes(parts[1].read_bytes()[:-100])  # as a disk that was full leaves it
-    (tmp_path / "b" / rows.PARTS / "0000007.parquet.new").write_bytes(b"PAR1")
+    (tmp_path / "b" / rows.PARTS / "0000007.arrow.new").write_bytes(b"ARROW1")
 
     campaign.check_resumed(asked, tmp_path / "b")
     begun: list[int] = []
@@ -549,7 +571,7 @@ def many(file: Path) -> None:
 
 
 def parts(folder: Path) -> list[Path]:
-    return sorted((folder / rows.PARTS).glob("*.parquet"))
+    return sorted((folder / rows.PARTS).glob("*.arrow"))
 
 
 @pytest.mark.long
