@@ -27,6 +27,7 @@ from ato_hil.can_dbc.codec import (
 
 ARMED, RUNNING, ENDED = values("RUN_CTRL", "RunState", "armed running ended")
 TICK_PERIOD = 1 << 16  # of the ticks on the bus
+LOOKED_AT = 1000  # frames, at once, for the one that says what is to be known
 
 FRAME = np.dtype(
     [
@@ -91,10 +92,11 @@ def run_controls(frame_ids: np.ndarray, words: np.ndarray) -> Iterator[tuple[int
 
 def timetable_rate(frames: np.ndarray) -> int:
     """Raw RUN_CTRL.TimetableRate of a run; 0, as planned, if no RUN_CTRL of it is good."""
-    _ticks, words = columns(frames, RUN_CTRL)
-    for word in words.tolist():
-        if e2e.check(word, -1, RUN_CTRL.data_id) == e2e.OK:
-            return int(get(word, RUN_CTRL.TimetableRate))
+    for first in range(0, len(frames), LOOKED_AT):  # as a rule the first of all is good
+        _ticks, words = columns(frames[first : first + LOOKED_AT], RUN_CTRL)
+        for word in words.tolist():
+            if e2e.check(word, -1, RUN_CTRL.data_id) == e2e.OK:
+                return int(get(word, RUN_CTRL.TimetableRate))
     return 0
 
 
@@ -149,8 +151,8 @@ def held_values(at: np.ndarray, values: np.ndarray, ticks: int) -> np.ndarray:
     the first one, the first; all 0 if there is none."""
     if not len(at):
         return np.zeros(ticks)
-    latest = np.cumsum(np.bincount(at, minlength=ticks)[:ticks]) - 1
-    return np.asarray(values[np.maximum(latest, 0)])
+    until = np.minimum(at[1:], ticks)  # each is held until the next
+    return np.repeat(values, np.diff(until, prepend=0, append=ticks))
 
 
 def physical(words: np.ndarray, message: Any, signal: str) -> np.ndarray:

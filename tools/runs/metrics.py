@@ -31,29 +31,31 @@ def run_metrics(
     scenario = loaded.scenario
     ticks = len(truth)
     reference = loaded.profile
+    speed = np.ascontiguousarray(truth["speed_m_s"])
     position_error = truth["position_m"] - reference.position_m[:ticks]
-    speed_error = truth["speed_m_s"] - reference.speed_m_s[:ticks]
+    speed_error = speed - reference.speed_m_s[:ticks]
     first = round(scenario.metrics.from_s / scenario.period_s)
     last = min(ticks, scenario.metrics.to_s / scenario.period_s + 1)
     window = slice(first, int(last))
     e, ed = position_error[window], speed_error[window]
+    delta = None if alpha is None else alpha * e + ed
     mass = scenario.train.mass_kg
     tonnes = mass / 1000.0
     work = {
         name: float(truth[f"{name}_j"][-1]) / 3.6e6 / tonnes + 0.0  # no -0
         for name in ("traction", "braking", "recuperated")
     }
-    margin = np.min(truth["permitted_speed_m_s"] - truth["speed_m_s"])
-    stopped = abs(truth["speed_m_s"][-1]) < STOPPED_M_S
+    margin = np.min(truth["permitted_speed_m_s"] - speed)
+    stopped = abs(speed[-1]) < STOPPED_M_S
     jerk = np.diff(command_n) / (mass * scenario.period_s)
     row: dict[str, Any] = {
         "ticks": ticks,
-        "max_delta_m_s": None if alpha is None else _peak(alpha * e + ed),
+        "max_delta_m_s": None if delta is None else _peak(delta),
         "max_speed_error_m_s": _peak(ed),
         "max_position_error_m": _peak(e),
         "rms_speed_error_m_s": _rms(ed),
         "rms_position_error_m": _rms(e),
-        "rms_delta_m_s": None if alpha is None else _rms(alpha * e + ed),
+        "rms_delta_m_s": None if delta is None else _rms(delta),
         "stop_error_m": float(position_error[-1]) if stopped else None,
         "end_position_error_m": float(position_error[-1]),
         "max_acceleration_m_s2": _peak(truth["acceleration_m_s2"]),

@@ -11,21 +11,26 @@ import xxhash
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ato_hil.can_dbc import e2e
 from ato_hil.can_dbc.codec import (
     ATO_ESTIMATE,
     MESSAGES,
+    RUN_CTRL,
     TRAIN_SPEED,
     bytes_of,
     database,
+    put,
     word_of,
 )
 from ato_hil.tools.runs.frames import (
     FRAME,
+    LOOKED_AT,
     Digest,
     columns,
     decode,
     estimate,
     held_values,
+    timetable_rate,
 )
 
 WORDS = st.integers(-(2**63), 2**63 - 1)
@@ -149,6 +154,17 @@ def test_a_value_is_held_until_the_next(at: list[int], ticks: int) -> None:
         max([i for i, each in enumerate(at) if each <= tick], default=0) for tick in range(ticks)
     ]
     assert held.tolist() == last
+
+
+@given(st.integers(0, 2 * LOOKED_AT), st.integers(-(2**23), 2**23 - 3), st.integers(0, 1))
+def test_the_first_good_frame_says_the_rate_of_the_timetable(bad, rate, later) -> None:
+    wrong, good, other = (
+        e2e.protect(put(RUN_CTRL.TimetableRate, each), 1, RUN_CTRL.data_id)
+        for each in (rate + 1, rate, rate + 2)
+    )
+    words = [wrong ^ 1] * bad + [good] + [other] * later
+    assert timetable_rate(frames_of([(0, RUN_CTRL.frame_id, word) for word in words])) == rate
+    assert timetable_rate(frames_of([(0, RUN_CTRL.frame_id, word) for word in words[:bad]])) == 0
 
 
 def test_what_was_never_sent_is_zero() -> None:
