@@ -11,6 +11,7 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -57,7 +58,14 @@ class Law:
 
 def law_names() -> list[str]:
     """Names of all laws, sorted."""
-    return sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(laws.__path__))
+    return list(_law_names())
+
+
+@cache
+def _law_names() -> tuple[str, ...]:
+    """The same; the folder is read once."""
+    names = (module.name.replace("_", "-") for module in pkgutil.iter_modules(laws.__path__))
+    return tuple(sorted(names))
 
 
 def is_file(name: str) -> bool:

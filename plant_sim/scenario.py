@@ -364,6 +364,8 @@ def _without(place: str, inherited: dict[str, Any], content: dict[str, Any]) -> 
     keys = content.get("unset", [])
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
         raise ScenarioError(f"{place}: key unset: expected a list of keys, as train.start_m")
+    if not keys:
+        return inherited
     result = copy.deepcopy(inherited)
     for key in keys:
         *tables, last = key.split(".")

@@ -319,7 +319,8 @@ def _noise(generator: np.random.Philox, ticks: int) -> np.ndarray:
 def chances(here: World, run: int) -> Any:
     """Random numbers of a run, [trains, ticks] of plant.CHANCE, for the steps."""
     noisy = failures.needs_noise(here.fails)
-    return rows(np.stack([chance(train, here.seed, run, noisy) for train in here.members]))
+    drawn = [chance(train, here.seed, run, noisy) for train in here.members]
+    return rows(np.stack(drawn) if len(drawn) > 1 else drawn[0][np.newaxis])  # one is not copied
 
 
 def chance(loaded: Loaded, seed: int, run: int, noisy: bool = False) -> np.ndarray:

@@ -13,7 +13,7 @@ from ato_hil.can_dbc import faults
 from ato_hil.can_dbc.errors import InputError
 from ato_hil.can_dbc.step import refusal
 from ato_hil.plant_sim import failures
-from ato_hil.plant_sim.scenario import Loaded, members, overlaid, shortened
+from ato_hil.plant_sim.scenario import Loaded, Scenario, members, overlaid, shortened
 from ato_hil.tools.runs import onboard
 from ato_hil.tools.runs.result import Run
 from ato_hil.tools.session import in_process, processes
@@ -41,7 +41,10 @@ def load(job: Job) -> Loaded:
 
 def numbers(job: Job) -> range:
     """Of its runs. Raises ScenarioError or LawError."""
-    scenario = load(job).scenario
+    return _numbers(job, load(job).scenario)
+
+
+def _numbers(job: Job, scenario: Scenario) -> range:
     return onboard.run_numbers(job.law or scenario.law, job.runs or scenario.runs)
 
 
@@ -60,7 +63,8 @@ def runs(job: Job) -> Iterator[Run]:
     plan, fails = _faults(job, loaded)
     compile_once(loaded, law)
     nodes = onboard.controllers_for(members(loaded), law)
-    return in_process.drive(loaded, nodes, numbers(job), job.seed, plan=plan, fails=fails)
+    ours = _numbers(job, loaded.scenario)
+    return in_process.drive(loaded, nodes, ours, job.seed, plan=plan, fails=fails)
 
 
 def _faults(job: Job, loaded: Loaded) -> tuple[faults.Plan | None, list[failures.AnyFailure]]:
