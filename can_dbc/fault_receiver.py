@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from ato_hil.can_dbc import e2e
 from ato_hil.can_dbc.codec import INDEX_OF_FRAME_ID, MESSAGES, word_of
@@ -129,6 +130,27 @@ class Receiver:
         self._held: dict[tuple[int, int], list[Frame]] = {}  # by rule and identifier
         self._late: dict[int, list[Frame]] = {}  # by the tick in which they come
         self._room: dict[int, int] = {}  # frames that a babbling rule leaves in this tick
+
+    def quiet_ticks(self) -> float:
+        """For how many ticks, this one included, frames come as they are and nothing is to be
+        logged; infinite to the end of the run."""
+        begins = [*self._late]
+        for each in self._rules:
+            if self._tick < each.end:
+                begins.append(max(each.first, self._tick))
+        for fails in self._planned:
+            if fails.tick >= self._tick and (not fails.runs or self._run in fails.runs):
+                begins.append(fails.tick)
+        return min(begins, default=float("inf")) - self._tick
+
+    def pass_over(self, ticks: int, can_ids: np.ndarray, payloads: np.ndarray) -> None:
+        """So many of these ticks, whose frames, [frames] each, came without `deliver`."""
+        for can_id in self._counts if self._rules else ():
+            at = np.flatnonzero(can_ids == can_id)
+            if len(at):
+                self._counts[can_id] += len(at)
+                self._last[can_id] = int(payloads[at[-1]])
+        self._tick += ticks
 
     def deliver(self, can_id: int, payload: int) -> list[Frame]:
         """What the node receives because this frame came."""

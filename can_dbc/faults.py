@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args
 
 import msgspec
+import numpy as np
 
 from ato_hil.can_dbc import settings
 from ato_hil.can_dbc.codec import MESSAGES, database
@@ -247,6 +248,15 @@ class Planned(NamedTuple):
     message: str  # what fails
     kind: str
     number: int  # place in the file, from 1
+
+
+def share_touched(plan: Plan, ticks: int) -> float:
+    """0..1: of so many ticks of a run, those that a rule of the bus may touch."""
+    touched = np.zeros(ticks, bool)
+    for rule in plan.bus:
+        first, end = ticks_of(rule, plan.period_s)
+        touched[first : int(min(end, ticks))] = True
+    return float(np.mean(touched))
 
 
 def load(path: Path, seed: int, period_s: float) -> Plan:

@@ -69,6 +69,16 @@ class Inbox:
             for frame in self._faults.close_tick():
                 self.put(*frame)
 
+    def quiet_ticks(self) -> float:
+        """For how many ticks, this one included, frames come as they are; may be infinite."""
+        return float("inf") if self._faults is None else self._faults.quiet_ticks()
+
+    def pass_over(self, ticks: int, can_ids: np.ndarray, payloads: np.ndarray) -> None:
+        """So many of these ticks, whose frames, [frames] each, came into the mailboxes without
+        `take`."""
+        if self._faults is not None:
+            self._faults.pass_over(ticks, can_ids, payloads)
+
     def begin_run(self, run: int) -> None:
         """Before the first frame of a run."""
         self.refused.fill(0)

@@ -433,3 +433,12 @@ def test_signals_to_processes(tmp_path: Path) -> None:
     ]
     with pytest.raises(FaultError, match=r"key process\[1\]: node is 'b', expected one of a$"):
         faults.load_signals(file, ["a"], PERIOD_S)
+
+
+def test_share_of_a_run_that_rules_may_touch(tmp_path: Path) -> None:
+    text = '[[bus]]\nkind = "drop"\nfrom = 0.5\nto = 1.5\n'
+    text += '[[bus]]\nkind = "stuck"\nfrom = 1.0\nto = 2.0\n'
+    assert faults.share_touched(plan(text, tmp_path), 600) == 0.25
+    assert faults.share_touched(plan(text, tmp_path), 50) == 0.0
+    assert faults.share_touched(plan('[[bus]]\nkind = "drop"\n', tmp_path), 600) == 1.0
+    assert faults.share_touched(plan("", tmp_path), 600) == 0.0

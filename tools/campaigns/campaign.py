@@ -19,8 +19,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ato_hil.can_dbc import faults
 from ato_hil.can_dbc.errors import InputError, expected
 from ato_hil.can_dbc.step import source_digest
+from ato_hil.plant_sim.scenario import Loaded
 from ato_hil.tools.campaigns import rows as kept_rows
 from ato_hil.tools.campaigns import statistics, worst
 from ato_hil.tools.campaigns.campaign_file import (
@@ -42,9 +44,10 @@ from ato_hil.tools.session.spread import Lost
 FILE = "campaign.json"
 SCHEMA = 1
 # What a batch is to take, in control periods of a train: long against what a batch costs, short
-# against a coffee. A run with faults is made frame by frame, which takes so much longer.
+# against a coffee. A tick that a fault of the bus may touch is made frame by frame, which takes so
+# much longer.
 LEAST_TICKS, MOST_TICKS, BATCHES = 400_000, 4_000_000, 256
-FRAME_BY_FRAME = 60
+FRAME_BY_FRAME = 30
 CHECKED = 256  # scenarios that are tried before the first run
 LEFT_OUT = ("ticks_per_s", "frames_lost")  # how fast this machine was, and what is of buses
 
@@ -264,10 +267,17 @@ def _batch_size(campaign: Campaign) -> int:
     folder = _folder_of(tuple(campaign.files.items()))
     first = here(campaign.session(0).job, folder, campaign.files)
     loaded = job.load(first)
-    of_plans = [1 if plan == NONE else FRAME_BY_FRAME for plan in campaign.plans]
+    of_plans = [
+        1.0 if plan == NONE else 1 + FRAME_BY_FRAME * _share_by_hand(folder / plan, loaded)
+        for plan in campaign.plans
+    ]
     ticks = loaded.ticks * loaded.trains * len(job.numbers(first)) * float(np.mean(of_plans))
     wanted = campaign.sessions / BATCHES
     return max(int(min(max(wanted, LEAST_TICKS / ticks), MOST_TICKS / ticks)), 1)
+
+
+def _share_by_hand(plan: Path, loaded: Loaded) -> float:
+    return faults.share_touched(faults.load(plan, 0, loaded.scenario.period_s), loaded.ticks)
 
 
 def batch(campaign: Campaign, number: int, size: int, mark: str) -> Batch:

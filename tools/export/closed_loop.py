@@ -103,6 +103,7 @@ class Loop:
             sil.build_loop(tick, sense, act),
             (
                 INT,
+                INT,
                 Rows(plant_params, 1),
                 LIMITS,
                 Rows(track.SECTION, 1),
@@ -251,10 +252,10 @@ def run(loaded: Loaded, law: str, runs: range, seed: int) -> Iterator[tuple[list
         native.restype = None
         seconds = 0.0
 
-        def loop(ticks: int, *arguments: Any) -> None:
+        def loop(first: int, end: int, *arguments: Any) -> None:
             nonlocal seconds
             # As sil.build_loop's: limits are a tuple of arrays, the profile a plain pointer.
-            passed: list[Any] = [ctypes.c_int64(ticks)]
+            passed: list[Any] = [ctypes.c_int64(first), ctypes.c_int64(end)]
             for k, argument in enumerate(arguments):
                 if isinstance(argument, tuple):
                     limits = (_Rows * len(argument))(*map(rows, argument))

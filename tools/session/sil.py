@@ -48,12 +48,13 @@ def clear(mailboxes: Any) -> None:
 
 @lru_cache(maxsize=16)  # an interpreted one that is watched is another each time
 def build_loop(controller_tick: Any, sense: Any, actuate_and_advance: Any) -> Any:
-    """Loop over `ticks` control periods of the plant and the controllers of all its trains; leaves
-    the number of frames logged of each train in `counts`."""
+    """Loop over the control periods from `first` up to `end` of the plant and the controllers of
+    all its trains; `counts` are the frames logged so far of each train."""
 
     @step
     def loop(
-        ticks: Any,
+        first: Any,
+        end: Any,
         plant_params: Any,
         limits: Any,
         track: Any,
@@ -70,9 +71,7 @@ def build_loop(controller_tick: Any, sense: Any, actuate_and_advance: Any) -> An
         counts: Any,
     ) -> None:
         trains = len(plant_state)
-        for train in range(trains):
-            counts[train] = 0
-        for tick in range(ticks):
+        for tick in range(first, end):
             for train in range(trains):
                 clear(to_controllers[train])
             sense(plant_params, limits, plant_state, chance, tick, to_controllers)
@@ -108,37 +107,15 @@ def run_line(
     `build_loop`, with the same arguments."""
     here = world.build(loaded, seed)
     made = Runs(members(loaded), nodes[0].calibration.law)
-    params, state, cells = _put_side_by_side(nodes, here)
     sense = here.sense
     if INTERPRETED and progress:  # where a run takes minutes
         sense = _watched(sense, lambda tick: progress(number, tick))
     loop = loop or build_loop(nodes[0].tick, sense, here.actuate_and_advance)
+    drive = driver(here, nodes, loop)
+    for train, node in enumerate(nodes):
+        node.rx, node.tx = here.tx[train], here.rx[train]
     trains = len(nodes)
-    counts = np.zeros(trains, np.int64)
-
-    def drive(ticks: int, chance: Any, truth: Any, frames: Any) -> None:
-        loop(
-            ticks,
-            here.params,
-            here.limits,
-            here.track,
-            here.state,
-            chance,
-            truth,
-            params,
-            nodes[0].profile,
-            state,
-            cells,
-            here.tx,
-            here.rx,
-            frames,
-            counts,
-        )
-
     number = runs.start
-    # Compiles, or loads what was compiled before.
-    kinds = (plant.CHANCE, plant.TRUTH, FRAME)
-    drive(0, *(rows(np.zeros((trains, 0), kind)) for kind in kinds))
 
     def one() -> Run:
         """Run `number`. Nothing here holds it: the next takes its memory if the caller has done
@@ -151,8 +128,9 @@ def run_line(
         truth = np.zeros((trains, ticks), plant.TRUTH)
         # As many rows as there could be; the system gives memory to those that are written.
         frames = np.empty((trains, ticks * MESSAGE_COUNT), FRAME)
+        counts = np.zeros(trains, np.int64)
         started = time.perf_counter()
-        drive(ticks, chance, rows(truth), rows(frames))
+        drive(0, ticks, chance, rows(truth), rows(frames), counts)
         seconds = time.perf_counter() - started
         faults = [fault_names(int(node.state[0]["core"]["faults"])) for node in nodes]
         _announce(here, nodes, plant.ENDED, number)
@@ -179,11 +157,10 @@ def _watched(sense: Any, progress: Callable[[int], None]) -> Any:
     return watched
 
 
-def _put_side_by_side(
-    nodes: list[controller_node.Controller], here: world.World
-) -> tuple[Any, Any, Any]:
-    """Params, state and memories of all controllers as arrays; the controllers keep views of their
-    rows, and of the plant's mailboxes, which are the buses."""
+def driver(here: world.World, nodes: list[controller_node.Controller], loop: Any) -> Any:
+    """`drive(first, end, chance, truth, frames, counts)`: `loop` over this plant and these
+    controllers, compiled. Their params, states and memories stand side by side from then on, and
+    the controllers have views of their rows."""
     params = rows(np.zeros(len(nodes), nodes[0].params.dtype))
     state = rows(np.zeros(len(nodes), nodes[0].state.dtype))
     cells = np.stack([node.cells for node in nodes])
@@ -191,8 +168,34 @@ def _put_side_by_side(
         params[train], state[train] = node.params[0], node.state[0]
         node.params, node.state = params[train : train + 1], state[train : train + 1]
         node.cells = cells[train]
-        node.rx, node.tx = here.tx[train], here.rx[train]
-    return params, state, cells
+
+    def drive(
+        first: int, end: int, chance: Any, truth: Any, frames: Any, counts: np.ndarray
+    ) -> None:
+        loop(
+            first,
+            end,
+            here.params,
+            here.limits,
+            here.track,
+            here.state,
+            chance,
+            truth,
+            params,
+            nodes[0].profile,
+            state,
+            cells,
+            here.tx,
+            here.rx,
+            frames,
+            counts,
+        )
+
+    # Compiles, or loads what was compiled before.
+    kinds = (plant.CHANCE, plant.TRUTH, FRAME)
+    chance, truth, frames = (rows(np.zeros((len(nodes), 0), kind)) for kind in kinds)
+    drive(0, 0, chance, truth, frames, np.zeros(len(nodes), np.int64))
+    return drive
 
 
 def _announce(
