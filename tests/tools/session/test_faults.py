@@ -127,7 +127,7 @@ def test_faults_change_the_run_and_no_faults_do_not(ato_hil, short: Path, tmp_pa
     options = ("run", str(short), "--mode", "sil", "--no-trace")
     digests = []
     for more in ((), ("--faults", "none.toml"), ("--faults", "faults.toml")):
-        done = ato_hil(*options, *more, "--out", "o", cwd=tmp_path)
+        done = ato_hil(*options, *more, "--out", "o", "--overwrite", cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         digests.append(json.loads((tmp_path / "o" / "summary.json").read_text())["digest"])
     assert digests[0] == digests[1] != digests[2]
