@@ -54,14 +54,14 @@ class ThinnedTrace(TraceWriter):
         self._worst: tuple[float, int] = (-1.0, self._first)  # largest error, and of which run
         self._before: int | None = None  # the run that ended last, if it is still held
 
-    def frames(self, run: int, frames: np.ndarray, train: int = 0, every: int = 1) -> None:
+    def frames(self, run: int, frames: np.ndarray, train: int = 0) -> None:
         """As TraceWriter, later."""
         if run == self._first:
             super().frames(run, frames, train)
         else:
             self._of(run).frames.setdefault(train, []).append(frames.copy())
 
-    def truth(self, run: int, table: np.ndarray, train: int = 0, every: int = 1) -> None:
+    def truth(self, run: int, table: np.ndarray, train: int = 0) -> None:
         """As TraceWriter, later."""
         if run == self._first:
             super().truth(run, table, train)
@@ -100,9 +100,9 @@ class ThinnedTrace(TraceWriter):
         if held is None:
             return
         for train, batches in sorted(held.frames.items()):
-            super().frames(run, np.concatenate(batches), train, every)
+            self._log_batch(run, np.concatenate(batches), train, every)
         for table, train in held.truths:
-            super().truth(run, table, train, every)
+            self._log_truth(run, table, train, every)
         if every > 1:
             self.thinned.append(run)
             self.text(run, 0, f"run {run} is thinned: smallest and largest of {every} ticks")

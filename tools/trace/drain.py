@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 PIECE = 1 << 20  # bytes
@@ -18,23 +19,19 @@ NAMES = next((each for each in ("/proc/self/fd", "/dev/fd") if os.path.isdir(eac
 class Drain:
     """Writes into a file what comes through a pipe, in a thread of its own."""
 
-    def __init__(self, path: Path) -> None:
-        """Make the file. Raises OSError."""
+    def __init__(self, path: Path, begin: Callable[[str], object]) -> None:
+        """Make the file, and have `begin` open the pipe of this name to write: the file is whole
+        when who opened it has closed it. Raises OSError, or what `begin` raises."""
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
-        self._read, self._write = os.pipe()
+        self._read, write = os.pipe()
         self._error: OSError | None = None
         # A program that never closes it still ends.
         self._thread = threading.Thread(target=self._run, name="trace file", daemon=True)
         self._thread.start()
-
-    @property
-    def entrance(self) -> str:
-        """Name of the pipe, for one who opens it to write; then call `opened`."""
-        return f"{NAMES}/{self._write}"
-
-    def opened(self) -> None:
-        """The file is whole when all who opened the pipe have closed it."""
-        os.close(self._write)
+        try:
+            begin(f"{NAMES}/{write}")
+        finally:
+            os.close(write)
 
     def close(self) -> None:
         """Wait until the file is whole. Raises OSError: it is not."""

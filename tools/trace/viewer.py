@@ -133,9 +133,7 @@ def overlay(recorded: Sequence[Recorded], file: Path, law_compare: bool = False)
     stream = rr.RecordingStream("ato-hil", recording_id="sessions")
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
-    drain = Drain(file)
-    stream.set_sinks(rr.FileSink(drain.entrance))
-    drain.opened()
+    drain = Drain(file, lambda pipe: stream.set_sinks(rr.FileSink(pipe)))
     stream.send_recording_name(", ".join(each.label for each in recorded))
     try:
         for number, each in enumerate(recorded):

@@ -197,12 +197,14 @@ class TraceWriter:
         # Equal for equal arguments, but for no two files: a viewer merges recordings of one name.
         identity = (str(path.resolve()), title, period_s, cars, estimates, first_run, last_run)
         name = hashlib.blake2b(repr(identity).encode(), digest_size=16).hexdigest()
+
+        def begin(pipe: str) -> None:
+            self._file = self._open(rr.FileSink(pipe), name, title)
+
         try:
-            self._drain = Drain(path)
+            self._drain = Drain(path, begin)
         except OSError as error:
             raise TraceError(f"{path}: cannot write the trace: {error.strerror}") from None
-        self._file = self._open(rr.FileSink(self._drain.entrance), name, title)
-        self._drain.opened()
         self._streams = [self._file]
         if live_port is not None:
             server = rr.GrpcServerSink("127.0.0.1", live_port, server_memory_limit=LIVE_MEMORY)
@@ -221,14 +223,16 @@ class TraceWriter:
         stream.send_recording_name(title)
         return stream
 
-    def frames(self, run: int, frames: np.ndarray, train: int = 0, every: int = 1) -> None:
+    def frames(self, run: int, frames: np.ndarray, train: int = 0) -> None:
         """Log FRAME rows of whole ticks; the batches of a train's run follow one another.
 
         Batches of 100 ticks and more are cheap: a batch costs some milliseconds by itself.
-
-        :param every: above 1, of so many ticks only the smallest and the largest value of a line
-            are logged, and no frames.
         """
+        self._log_batch(run, frames, train)
+
+    def _log_batch(self, run: int, frames: np.ndarray, train: int, every: int = 1) -> None:
+        """Log frames; above 1, of `every` ticks only the smallest and the largest value of a line
+        are logged, and no frames."""
         started = time.perf_counter()
         found = {message.name: columns(frames, message) for message in MESSAGES}
         if self._run is None or run > self._run:
@@ -270,16 +274,18 @@ class TraceWriter:
                 f"reference/{field}{branch}", ticks, values, ["reference"], [REFERENCE]
             )
 
-    def truth(self, run: int, table: np.ndarray, train: int = 0, every: int = 1) -> None:
+    def truth(self, run: int, table: np.ndarray, train: int = 0) -> None:
         """Log the true state of the plant: a structured array of float64 fields, a row a tick.
 
         The names of the fields end in their units; a field of NaN alone is none of this train's.
         A table with `position_m` is the plant's state: it shares one entity, the speeds that
         supervise the train another, and its errors against the reference are logged beside it. Of
         another table, such as the Lyapunov function, each field is an entity.
-
-        :param every: as of `frames`.
         """
+        self._log_truth(run, table, train)
+
+    def _log_truth(self, run: int, table: np.ndarray, train: int, every: int = 1) -> None:
+        """Log a true state; `every` as of `_log_batch`."""
         ticks = np.arange(len(table))
         label = self._run_name(run) if self._trains == 1 else f"train_{train + 1}"
         own = ([label.replace("_", " ")], [self._colour(run, train)])
