@@ -18,6 +18,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from typing import Any, NamedTuple
 
 from ato_hil.can_dbc.child import safe_path
@@ -56,6 +57,7 @@ def spread(
 
     Raises what the function raises. Closing the generator ends all processes, whatever they do.
     """
+    _begin_tracker()
     given = (_Given(index, task) for index, task in enumerate(tasks))
     idle = [_Worker(function) for _ in range(workers or cores())]
     busy: dict[Future[Any], tuple[_Worker, _Given]] = {}
@@ -83,6 +85,17 @@ def spread(
     finally:
         for worker in everyone:
             worker.end()
+
+
+def _begin_tracker() -> None:
+    """Python's own process that tracks what processes share ignores Ctrl-C and SIGTERM, but a
+    terminal that is closed would end it: the next one knows of nothing, and says so by a traceback.
+    What blocks a signal passes that on to its children."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _give(

@@ -113,6 +113,34 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
         time.sleep(0.1)
 
 
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
+def test_a_terminal_that_is_closed_ends_all_without_a_word(number: signal.Signals) -> None:
+    script = (
+        "from ato_hil.tools.cli.console import end_as_with_ctrl_c\n"
+        "from ato_hil.tools.session.spread import spread\n"
+        "import time\n"
+        "if __name__ == '__main__':\n"
+        "    end_as_with_ctrl_c()\n"
+        "    try:\n"
+        "        for _ in spread(time.sleep, [0.0, 60.0], 1):\n"
+        "            print('one', flush=True)\n"
+        "    except KeyboardInterrupt:\n"
+        "        raise SystemExit(130)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-P", "-c", script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "one\n"
+        os.killpg(parent.pid, number)  # as the system does: to all of them
+        _said, why = parent.communicate(timeout=60)
+    assert (parent.returncode, why) == (130, "")
+
+
 def test_ctrl_c_while_a_process_is_begun_waits_until_it_can_be_ended(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
