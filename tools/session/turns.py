@@ -20,13 +20,20 @@ from ato_hil.tools.runs import locks
 def on_one_core(processes: Iterable[int], with_this_thread: bool = False) -> Iterator[None]:
     """Keeps processes on a core that no other session has so; in the end they are as they were.
 
-    Where there is no process, or but one core, or none is free, nothing is done.
+    It is the core on which the first of them was last, or the next one that is free: where others
+    that know nothing of these sessions are at work, the scheduler will have heeded them. Where
+    there is no process, or but one core, or none is free, nothing is done.
     """
     threads = [thread for process in processes for thread in threads_of(process)]
     if threads and with_this_thread:
         threads.append(threading.get_native_id())
-    cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
-    with locks.core_held(sorted(cores) if threads and len(cores) > 1 else []) as core:
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
+    if not threads or len(cores) == 1:
+        cores = []
+    if cores:
+        last = last_core(threads[0])
+        cores.sort(key=lambda core: (core < last, core))
+    with locks.core_held(cores) as core:
         before: dict[int, set[int]] = {}
         if core is not None:
             for thread in threads:
@@ -47,3 +54,12 @@ def threads_of(process: int) -> list[int]:
         return [int(task.name) for task in Path(f"/proc/{process}/task").iterdir()]
     except OSError:
         return []
+
+
+def last_core(thread: int) -> int:
+    """The core on which a thread was last; 0 where the system does not tell."""
+    try:
+        text = Path(f"/proc/{thread}/stat").read_text(encoding="utf-8")
+        return int(text.rpartition(")")[2].split()[36])
+    except (OSError, IndexError, ValueError):
+        return 0

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 from ato_hil.can_dbc.hub import HubBus
 from ato_hil.tools.session import session
 from ato_hil.tools.session.options import Silent
-from ato_hil.tools.session.turns import on_one_core, threads_of
+from ato_hil.tools.session.turns import last_core, on_one_core, threads_of
 
 pytestmark = pytest.mark.skipif(
     not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2, reason="one core"
@@ -53,7 +54,7 @@ def test_all_threads_share_a_core_and_are_then_as_they_were(
     child: subprocess.Popen[str], runtime_dir: Path
 ) -> None:
     everywhere = os.sched_getaffinity(0)
-    first = {min(everywhere)}
+    first = {last_core(child.pid)}
     with on_one_core([child.pid], with_this_thread=True):
         assert cores_of(child.pid) == [first] * 3
         assert os.sched_getaffinity(0) == first
@@ -74,17 +75,29 @@ def test_each_session_has_its_own_and_one_too_many_has_none(
     os.sched_setaffinity(0, {one, other})  # as a user may have it
     try:
         with on_one_core([child.pid]):
-            assert cores_of(child.pid) == [{one}] * 3
+            first = cores_of(child.pid)
+            assert first in ([{one}] * 3, [{other}] * 3)
             with on_one_core([child.pid]):
-                assert cores_of(child.pid) == [{other}] * 3
+                second = cores_of(child.pid)
+                assert second in ([{one}] * 3, [{other}] * 3)
+                assert second != first
                 with on_one_core([child.pid]):
-                    assert cores_of(child.pid) == [{other}] * 3
-            assert cores_of(child.pid) == [{one}] * 3
+                    assert cores_of(child.pid) == second
+            assert cores_of(child.pid) == first
         os.sched_setaffinity(0, {other})
         with on_one_core([child.pid]):
             assert cores_of(child.pid) == [everywhere] * 3
     finally:
         os.sched_setaffinity(0, everywhere)
+
+
+def test_the_core_is_the_one_on_which_a_process_was_last(child: subprocess.Popen[str]) -> None:
+    everywhere = os.sched_getaffinity(0)
+    for core in everywhere:
+        os.sched_setaffinity(0, {core})
+        assert last_core(threading.get_native_id()) == core
+    os.sched_setaffinity(0, everywhere)
+    assert last_core(2**22 + 1) == 0  # there is no such process
 
 
 def test_a_process_that_has_ended_is_no_matter(
@@ -136,10 +149,11 @@ def test_plant_controller_and_hub_share_a_core_in_lockstep(
             "subway", None, 1, "hil", "hub:turns", 1, tmp_path / "out", None, trace=False
         )
         session.run(options, looking)
+        (core,) = looking.cores["hub"]
         assert looking.cores == {
-            "hub": {min(everywhere)},
-            "plant_sim.process": {min(everywhere)},
-            "controller.process": {min(everywhere)},
+            "hub": {core},
+            "plant_sim.process": {core},
+            "controller.process": {core},
             "tools.session.recorder": everywhere,
         }
         assert cores_of(bus.hub_pid) == [everywhere]
