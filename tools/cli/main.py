@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from ato_hil.can_dbc.child import end_soon
 from ato_hil.tools.cli import (
     buses,
     campaign,
@@ -113,6 +114,7 @@ def main() -> None:
         if word == "--view" and sys.argv[at + 1 : at + 2] not in (["web"], ["native"]):
             sys.argv[at] = f"--view={Viewer.native.value}"
     ignore_other_tools()
+    end_soon()
     end_as_with_ctrl_c()
     with streams():
         try:

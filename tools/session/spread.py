@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from typing import Any, NamedTuple
 
-from ato_hil.can_dbc.child import safe_path
+from ato_hil.can_dbc.child import end_soon, safe_path
 from ato_hil.tools.session.interrupts import Interrupts
 
 ATTEMPTS = 2
@@ -158,3 +158,4 @@ def _begin() -> None:
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True, name="parent").start()
+    end_soon()
