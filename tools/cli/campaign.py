@@ -167,6 +167,7 @@ class Meter:
             transient=True,
             disable=not console.is_terminal,
             speed_estimate_period=120.0,
+            refresh_per_second=2,  # each takes a millisecond from the runs
         )
         self._task = self._bar.add_task("runs", total=total, rate="")
 
