@@ -96,8 +96,9 @@ COMMANDS = [
     ("bus-report brief.toml --json > bus.json", 0, 1),
     ("export c brief.toml --out firmware", 40, 1),
     ("new own.toml", 0, 1),
-    ("TMPDIR=$PWD {ato_hil} run brief.toml --bus hub --out {away} --no-trace", 0, 3),
-    ("TMPDIR=$PWD {ato_hil} run brief.toml --mode mil --runs 1 --out {away} --no-trace", 0, 3),
+    # Python looks for another place where there is no room for four bytes.
+    ("TMPDIR=$PWD {ato_hil} run brief.toml --bus hub --out {away} --no-trace", 8, 3),
+    ("TMPDIR=$PWD {ato_hil} run brief.toml --mode mil --runs 1 --out {away} --no-trace", 8, 3),
 ]
 
 
@@ -168,7 +169,7 @@ def test_a_recording_that_ends_early_is_a_session_that_ends_early(tmp_path: Path
 @pytest.mark.long
 @pytest.mark.parametrize(("command", "left_kb", "wanted"), COMMANDS)
 def test_a_full_disk_is_one_line_and_what_was_there_stays(
-    command: str, left_kb: int, wanted: int, prepared: Path, tmp_path: Path
+    command: str, left_kb: int, wanted: int, prepared: Path, tmp_path: Path, runtime_dir: Path
 ) -> None:
     status, lines = on_full_disk(prepared, command, left_kb, tmp_path)
     assert status == wanted, lines
