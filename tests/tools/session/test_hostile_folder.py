@@ -58,7 +58,7 @@ def test_a_sweep_imports_nothing_of_the_user(folder):
         ("verify", "pid", "--fast"),
         ("endurance", "--times", "1"),
         ("bench", "--no-sessions", "--bus", "hub:hostile"),
-        ("threats", "--fast"),
+        ("threats", "--frames", "1000"),
     ],
     ids=lambda arguments: arguments[0],
 )
