@@ -26,6 +26,7 @@ from ato_hil.tools.session.spread import Lost, cores, spread
 
 CASE = "case"  # the key that varies the scenario's named case
 LAW = "law."  # short for laws.<the law>.
+SETTLED = {"law": "ato-hil compare", "runs": "--runs"}  # by what else, for all points
 ENERGY, ERROR = "energy_kwh_per_t", "rms_position_error_m"
 
 
@@ -83,6 +84,8 @@ def plan(
     keys = [key for key, _values in varied]
     if twice := {key for key in keys if keys.count(key) > 1}:
         raise SweepError(f"--vary {min(twice)} is given twice")
+    for key in SETTLED.keys() & keys:
+        raise SweepError(f"--vary {key}: is the same for all combinations, see {SETTLED[key]}")
     points = []
     for combination in itertools.product(*(values for _key, values in varied)):
         values = dict(zip(keys, combination, strict=True))

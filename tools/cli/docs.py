@@ -61,7 +61,7 @@ EXIT_STATUS = f"""Exit status:
 | {EXIT_NOT_AS_EXPECTED} | `run --expect`: the last run is otherwise |
 | {EXIT_NOT_CONTROLLED} | `run`: a train was without a command for so long that its vehicle \
 braked (fault `not_controlled`), and no `--faults` had asked for that |
-| {EXIT_INTERRUPTED} | Ctrl-C or SIGTERM; what was finished is kept |
+| {EXIT_INTERRUPTED} | Ctrl-C, SIGTERM, or a terminal that is closed; what was finished is kept |
 
 Results are never replaced without a word. Without `--out` a session gets a folder of its own:
 `runs/subway-cailc-hil`, the next time `runs/subway-cailc-hil-2`. A folder or recording that has
