@@ -180,12 +180,17 @@ def _params(
 
 def supervised(loaded: Loaded) -> atp.Limits:
     """What ATP supervises, for the steps."""
+    return atp.Limits(*map(rows, tables(loaded)))
+
+
+def tables(loaded: Loaded) -> atp.Limits:
+    """The same as arrays."""
     scenario = loaded.scenario
     steepest = min(atp_tables.gradients(track.sections(scenario.track), 0.0).values)
     rolling_m_s2 = max(-steepest, 0.0) + scenario.disturbance.amplitude_m_s2
     pulling_m_s2 = scenario.actuator.force_max_m_s2 + rolling_m_s2
     limits = limits_of(loaded)
-    made = atp_tables.supervised(
+    return atp_tables.supervised(
         scenario.atp,
         limits,
         track.sections(track.known(scenario.track)),
@@ -193,7 +198,6 @@ def supervised(loaded: Loaded) -> atp.Limits:
         pulling_m_s2,
         rolling_m_s2,
     )
-    return atp.Limits(*map(rows, made))
 
 
 def limits_of(loaded: Loaded) -> np.ndarray:

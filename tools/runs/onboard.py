@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from ato_hil.controller.registry import (
     load_law,
 )
 from ato_hil.controller.yielding import YieldingSettings
-from ato_hil.plant_sim import track
+from ato_hil.plant_sim import approach, track
 from ato_hil.plant_sim.scenario import Loaded, Scenario, ScenarioError
 from ato_hil.plant_sim.trains import point
 from ato_hil.plant_sim.trains.lumped import GRAVITY_M_S2, N_PER_KN
@@ -62,13 +63,27 @@ def calibration_for(loaded: Loaded, law: str) -> Calibration:
             map_sections=_map_sections(loaded),
             start_m=loaded.start_m,
             line=_line(loaded),
-            yielding_settings=None
-            if scenario.control.yielding is None
-            else _settings("control.yielding", scenario.control.yielding, YieldingSettings),
+            yielding_settings=_yielding(loaded),
             scenario_digest=loaded.digest,
         )
     except CalibrationError as error:
         raise ScenarioError(f"{loaded.path}: {error}") from None
+
+
+def _yielding(loaded: Loaded) -> YieldingSettings | None:
+    """How the timetable gives way. Raises CalibrationError if it brakes more than ETCS permits."""
+    values = loaded.scenario.control.yielding
+    if values is None:
+        return None
+    settings: YieldingSettings = _settings("control.yielding", values, YieldingSettings)
+    most = approach.hardest(loaded, settings.margin_m_s)
+    if settings.brake_m_s2 > most.brake_m_s2:
+        raise CalibrationError(
+            f"control.yielding.brake_m_s2: {settings.brake_m_s2:g}, expected at most"
+            f" {math.floor(100 * most.brake_m_s2) / 100:g}, what ETCS permits towards"
+            f" {most.target_m_s:.3g} m/s, at {most.position_m:.0f} m"
+        )
+    return settings
 
 
 def _check_law_names(loaded: Loaded, law: str) -> None:
