@@ -11,6 +11,8 @@ within SECTIONS_MAX ticks.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +28,7 @@ from ato_hil.controller.q import (
     round_shift,
     sat32,
 )
-from ato_hil.controller.quantise import CalibrationError, fixed
+from ato_hil.controller.quantise import fixed
 
 SECTIONS_MAX = 128
 
@@ -42,17 +44,73 @@ PARAMS = np.dtype(
 )
 
 
+class _Stretch(NamedTuple):
+    """A piece of the way, and the integrals over it of the acceleration, of that times the distance
+    from its start, and of its square."""
+
+    from_m: float
+    length_m: float
+    sum: float
+    moment: float
+    square: float
+
+    def line(self) -> tuple[float, float, float]:
+        """The section that is nearest to it by least squares; the work over it is the same."""
+        length = self.length_m
+        slope = 12 * (self.moment - self.sum * length / 2) / (length * length * length)
+        return self.from_m, self.sum / length - slope * length / 2, slope
+
+    def error(self) -> float:
+        """How far its section is off, as the square of a potential."""
+        _from_m, start, slope = self.line()
+        length = self.length_m
+        middle = start + slope * length / 2
+        explained = length * (middle * middle + slope * slope * length * length / 12)
+        return (self.square - explained) * length
+
+
+def merged(
+    sections: Sequence[tuple[float, float, float]], most: int
+) -> list[tuple[float, float, float]]:
+    """At most so many sections: neighbours become one, those first over which the potential changes
+    least. The last one, which has no end, stays."""
+    ways: list[_Stretch] = []
+    for (at, a, s), (end, *_) in pairwise(sections):
+        n = end - at
+        square = a * a * n + a * s * n * n + s * s * n * n * n / 3
+        ways.append(
+            _Stretch(at, n, a * n + s * n * n / 2, a * n * n / 2 + s * n * n * n / 3, square)
+        )
+    errors = [_both(*pair).error() for pair in pairwise(ways)]
+    while len(ways) + 1 > most:
+        k = errors.index(min(errors))
+        ways[k : k + 2] = [_both(ways[k], ways[k + 1])]
+        del errors[k]
+        for beside in (k - 1, k):
+            if 0 <= beside < len(errors):
+                errors[beside] = _both(ways[beside], ways[beside + 1]).error()
+    return [*(way.line() for way in ways), *sections[-1:]]
+
+
+def _both(before: _Stretch, after: _Stretch) -> _Stretch:
+    moment = before.moment + after.moment + before.length_m * after.sum
+    return _Stretch(
+        before.from_m,
+        before.length_m + after.length_m,
+        before.sum + after.sum,
+        moment,
+        before.square + after.square,
+    )
+
+
 def calibrate(sections: Sequence[tuple[float, float, float]]) -> np.ndarray:
     """PARAMS, shape (1,). A section is where it begins (m), what it has there (m/s^2, positive
-    holds the train back) and its change a metre (1/s^2); before the first one the map is 0. Raises
-    CalibrationError if they do not fit."""
+    holds the train back) and its change a metre (1/s^2); before the first one the map is 0. More
+    than the map holds are merged. Raises CalibrationError if they do not fit."""
     params = np.zeros(1, PARAMS)
-    count = len(sections)
-    if count > SECTIONS_MAX:
-        raise CalibrationError(
-            f"control.map_share: {count} sections, expected up to {SECTIONS_MAX}"
-        )
-    params["sections"] = count
+    if len(sections) > SECTIONS_MAX:
+        sections = merged(sections, SECTIONS_MAX)
+    params["sections"] = len(sections)
     for k, (from_m, acceleration_m_s2, slope_1_s2) in enumerate(sections):
         key = f"control.map_share: section {k + 1}"
         params["start"][0, k] = fixed(f"{key}: from_m", from_m, 15)

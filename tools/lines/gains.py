@@ -18,7 +18,6 @@ class Known(NamedTuple):
     linear_1_s: float
     square_1_m: float
     steepest_m_s2: float  # largest gradient, either way
-    mapped: bool  # whether the controller knows the gradients
     speed_m_s: float  # largest
     late_s: float  # delay and lag of the actuators
 
@@ -26,7 +25,7 @@ class Known(NamedTuple):
 def tables(known: Known) -> dict[str, tuple[str, dict[str, Any]]]:
     """The rule and the gains of each law, by name."""
     late, mass, v = known.late_s, known.mass_kg, known.speed_m_s
-    unknown = min(0.02 + (0.1 if known.mapped else 1.2) * known.steepest_m_s2, XI_MAX[0])
+    unknown = min(0.02 + 0.1 * known.steepest_m_s2, XI_MAX[0])
     drag = known.constant_m_s2 + known.linear_1_s * v + known.square_1_m * v * v
     kd = 0.5 / late
     # N/t and km/h, as the paper has them.

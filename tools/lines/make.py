@@ -30,7 +30,6 @@ LAG_S = 0.3  # no file has it: that of a usual three-phase drive
 DELAY_TICKS = 1
 LARGEST_COMMAND_N = 520e3  # FORCE_CMD carries 524 kN
 LARGEST_M_S2 = 1.9  # a law's formats end at 2
-MAP_SECTIONS_MAX = 127  # of the onboard gradient map, its last row ends it
 CURVE_PIECE_M = 20.0  # a transition curve in steps
 
 
@@ -123,8 +122,6 @@ def scenario_text(line: Line, train: Train, run: Run, law: str, objective: str, 
     acceleration = min(train.max_acceleration_m_s2 or COMFORT_M_S2, COMFORT_M_S2)
     deceleration = min(train.max_deceleration_m_s2 or COMFORT_M_S2, COMFORT_M_S2)
     steepest = max((abs(value) for _, value in steps), default=0.0)
-    knots = len(steps) * (2 if train.length_m else 1)
-    mapped = knots <= MAP_SECTIONS_MAX
     late_s = LAG_S + DELAY_TICKS * PERIOD_S
     known = gains.Known(
         inertia_kg,
@@ -132,7 +129,6 @@ def scenario_text(line: Line, train: Train, run: Run, law: str, objective: str, 
         train.resistance_n_s_m / inertia_kg,
         train.resistance_n_s2_m2 / inertia_kg,
         steepest * GRAVITY_M_S2 * N_PER_KN,
-        mapped,
         train.max_speed_m_s,
         late_s,
     )
@@ -228,11 +224,7 @@ def scenario_text(line: Line, train: Train, run: Run, law: str, objective: str, 
         "",
         "[control]",
         f"preview_ticks = {round(late_s / PERIOD_S)}  # what delay and lag make late",
-        *(
-            ["map_share = 1.0  # the controller has the gradients on board"]
-            if mapped
-            else [f"# no gradient map: {knots} sections are more than it holds"]
-        ),
+        "map_share = 1.0  # the controller has the gradients on board",
         "",
         "[control.guard]",
         "hold_brake_m_s2 = 0.5  # at the stops",
