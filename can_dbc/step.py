@@ -1,4 +1,5 @@
-"""`@step`: the one decorator of all code that runs as firmware or inside the cyclic loop.
+"""`@step`: the one decorator of all code that runs as firmware or inside the cyclic loop, but for
+`@vector_step` where a plant does the same for several lanes.
 
 A step is compiled without the Python runtime: `_nrt=False` makes the compiler refuse whatever
 would allocate, so the allocation-free property is proved each time that a step compiles. The
@@ -28,7 +29,7 @@ import numba
 import numpy as np
 from numba.core import sigutils
 from numba.core.caching import _Cache
-from numba.core.compiler import CompileResult
+from numba.core.compiler import Compiler, CompileResult
 from numba.core.serialize import dumps
 
 from ato_hil.can_dbc import cache as cache_files
@@ -285,6 +286,30 @@ def step(function: Any) -> Any:
 
     Where NUMBA_DISABLE_JIT is set, calling the step raises StepError.
     """
+    return _compiled(function, Compiler)
+
+
+def vector_step(function: Any) -> Any:
+    """A step whose loops over the same few lanes, `range(8)`, become vector operations: the same
+    bits, sooner. For that a loop may sum nothing up in floats, and what it reads and writes stands
+    in one record, because the compiler does not know that two records do not overlap."""
+    return _compiled(function, _Vectorising)
+
+
+class _Vectorising(Compiler):
+    """Numba's, with LLVM at level 2: at 3, which is numba's own, LLVM unrolls short loops before it
+    looks whether they are vector operations."""
+
+    def compile_extra(self, function: Any) -> Any:
+        level = numba.config.OPT
+        numba.config.OPT = min(level, 2)  # who compiles holds numba's lock
+        try:
+            return super().compile_extra(function)
+        finally:
+            numba.config.OPT = level
+
+
+def _compiled(function: Any, pipeline: Any) -> Any:
     if INTERPRETED:
         return function
     if numba.config.DISABLE_JIT:
@@ -292,7 +317,12 @@ def step(function: Any) -> Any:
     # Inlined without asking what it costs: most steps are called from one place, and a call hands
     # over every array and record field by field.
     compiled = numba.njit(
-        nogil=True, error_model="numpy", boundscheck=False, forceinline=True, _nrt=False
+        nogil=True,
+        error_model="numpy",
+        boundscheck=False,
+        forceinline=True,
+        _nrt=False,
+        pipeline_class=pipeline,
     )(function)
     identity = _stable_identity(function)
     compiled._set_uuid(identity)

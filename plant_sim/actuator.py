@@ -143,7 +143,12 @@ def actuate(params: Any, state: Any, channel: Any) -> Any:
     """Force of a channel over the next integration step, N."""
     target = state.target[channel]
     actual = state.actual[channel]
-    gain = params.traction_gain if target > 0.0 else params.brake_gain
-    actual += gain * (target - actual)
+    actual += lag_gain(target, params.traction_gain, params.brake_gain) * (target - actual)
     state.actual[channel] = actual
     return actual
+
+
+@step
+def lag_gain(target_n: Any, traction: Any, brake: Any) -> Any:
+    """Which of two gains a channel has that goes to `target_n`."""
+    return traction if target_n > 0.0 else brake

@@ -12,7 +12,8 @@ The constant part of R_k fades in over 5 mm/s and the brake over 20 mm/s: neithe
 is at rest.
 
 Integration: semi-implicit Euler, `substeps` a control period; the coefficients of R_k are held over
-a control period.
+a control period. Each stage of a step is a loop over CARS_MAX lanes, which becomes vector
+operations. The lanes behind the last car have no mass, weight, force or coupler.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from ato_hil.can_dbc.step import int64, step
-from ato_hil.plant_sim.actuator import actuate, command_cars
+from ato_hil.can_dbc.step import int64, step, vector_step
+from ato_hil.plant_sim.actuator import command_cars, lag_gain
 from ato_hil.plant_sim.track import section_at
 from ato_hil.plant_sim.trains import lumped
 from ato_hil.plant_sim.trains.lumped import (
@@ -90,9 +91,30 @@ STATE = np.dtype(
         ("coupler_force_n", np.float64),  # largest tension or compression over the last period
         ("car_position_m", np.float64, (CARS_MAX,)),
         ("car_speed_m_s", np.float64, (CARS_MAX,)),
-        ("section", np.int64, (CARS_MAX,)),
-        ("davis", np.float64, (2, 3)),  # a, b, c of this control period
         ("phase", OSCILLATOR, (2,)),
+        # As in PARAMS: what `move` reads of the cars stands in this record.
+        ("inverse_mass", np.float64, (CARS_MAX,)),
+        ("weight_kn", np.float64, (CARS_MAX,)),
+        # Of this control period: R_k in N/kN, m/s, and the actuators.
+        ("a", np.float64, (CARS_MAX,)),
+        ("b", np.float64, (CARS_MAX,)),
+        ("c", np.float64, (CARS_MAX,)),
+        ("target_n", np.float64, (CARS_MAX,)),
+        ("actual_n", np.float64, (CARS_MAX,)),
+        ("gain", np.float64, (CARS_MAX,)),
+        # What `look_up` found for each car.
+        ("holds", np.int64),  # 1: still true
+        ("section", np.int64, (CARS_MAX,)),
+        ("until_m", np.float64, (CARS_MAX,)),  # where the section ends
+        ("track_n_per_kn", np.float64, (CARS_MAX,)),
+        ("fading", np.float64, (CARS_MAX,)),  # of the constant part of R_k, -1..1
+        ("brake_fading", np.float64, (CARS_MAX,)),
+        # Of this integration step.
+        ("tension_n", np.float64, (CARS_MAX,)),  # of the coupler behind
+        ("largest_n", np.float64, (CARS_MAX,)),  # the largest so far in this control period
+        ("resistance_n", np.float64, (CARS_MAX,)),
+        ("traction_w", np.float64, (CARS_MAX,)),
+        ("braking_w", np.float64, (CARS_MAX,)),  # 0 or less
     ],
     align=True,
 )
@@ -122,10 +144,17 @@ def calibrate(train: Train, period_s: float, smeared: bool) -> np.ndarray:
 @step
 def reset(params: Any, state: Any) -> None:
     """The train at rest, the couplers slack."""
-    for k in range(params.cars):
+    for k in range(CARS_MAX):
         state.car_position_m[k] = params.start_m - params.pitch_m * k
         state.car_speed_m_s[k] = 0.0
+        state.inverse_mass[k] = params.inverse_mass[k]
+        state.weight_kn[k] = params.weight_kn[k]
         state.section[k] = 0
+        state.until_m[k] = np.inf
+        state.track_n_per_kn[k] = 0.0
+        state.fading[k] = 0.0
+        state.brake_fading[k] = 0.0
+    state.holds = 0
     state.acceleration_m_s2 = 0.0
     state.force_n = 0.0
     state.traction_j = 0.0
@@ -152,48 +181,96 @@ def fading(speed_m_s: Any, full_m_s: Any) -> Any:
 
 
 @step
-def move(
-    params: Any, track: Any, state: Any, actuator_params: Any, actuator: Any, disturbance_m_s2: Any
-) -> None:
-    """One integration step, from the front: a car moves when the tension behind it is known."""
+def look_up(params: Any, track: Any, state: Any) -> Any:
+    """What acts on each car by its place and speed; 1 if that holds until `move` ends it."""
+    holds = int64(1)
+    for k in range(params.cars):
+        speed = state.car_speed_m_s[k]
+        section = section_at(track, state.car_position_m[k], state.section[k])
+        state.section[k] = section
+        state.track_n_per_kn[k] = track[section].resistance_n_per_kn
+        state.until_m[k] = track[section + 1].from_m if section + 1 < len(track) else np.inf
+        state.fading[k] = fading(speed, RESISTANCE_FULL_M_S)
+        state.brake_fading[k] = fading(speed, BRAKE_FULL_M_S)
+        if speed < BRAKE_FULL_M_S:
+            holds = int64(0)
+    return holds
+
+
+@vector_step
+def move(params: Any, state: Any, disturbance_m_s2: Any) -> Any:
+    """One integration step; 1 if no car has left its section or is so slow that forces fade."""
     h = params.step_s
+    cars = int64(params.cars)
+    pitch = params.pitch_m
+    stiffness = params.stiffness_n_m
+    damping = params.damping_n_s_m
     position = state.car_position_m
     speed = state.car_speed_m_s
-    davis = state.davis
-    last = int64(params.cars) - 1
-    largest = state.coupler_force_n
-    work = 0.0
-    braking = 0.0
-    ahead = 0.0
-    for k in range(last + 1):
+    inverse_mass = state.inverse_mass
+    weight = state.weight_kn
+    a = state.a
+    b = state.b
+    c = state.c
+    target = state.target_n
+    actual = state.actual_n
+    gain = state.gain
+    until = state.until_m
+    track = state.track_n_per_kn
+    constant_fading = state.fading
+    brake_fading = state.brake_fading
+    tension = state.tension_n
+    largest = state.largest_n
+    resistance = state.resistance_n
+    traction_w = state.traction_w
+    braking_w = state.braking_w
+
+    # tension_k and R_k + m_k g W, from the rear.
+    x_behind = 0.0
+    v_behind = 0.0
+    for lane in range(CARS_MAX):
+        k = CARS_MAX - 1 - lane
         x = position[k]
         v = speed[k]
-        behind = 0.0
-        if k < last:
-            stretch = x - position[k + 1] - params.pitch_m
-            behind = params.stiffness_n_m * stretch + params.damping_n_s_m * (v - speed[k + 1])
-            largest = max(largest, abs(behind))
-        force = actuate(actuator_params, actuator, k)
-        if force < 0.0:
-            force *= fading(v, BRAKE_FULL_M_S)
-        kind = int64(params.kind[k])
-        section = section_at(track, x, state.section[k])
-        state.section[k] = section
-        resistance = params.weight_kn[k] * (
-            davis[kind, 0] * fading(v, RESISTANCE_FULL_M_S)
-            + v * (davis[kind, 1] + davis[kind, 2] * abs(v))
-            + track[section].resistance_n_per_kn
+        stretch = x - x_behind - pitch
+        pulls = stiffness * stretch + damping * (v - v_behind)
+        pulls = pulls if k < cars - 1 else 0.0
+        tension[k] = pulls
+        largest[k] = max(largest[k], abs(pulls))
+        resistance[k] = weight[k] * (
+            a[k] * constant_fading[k] + v * (b[k] + c[k] * abs(v)) + track[k]
         )
-        pull = force - resistance + ahead - behind
-        v += h * (pull * params.inverse_mass[k] + disturbance_m_s2)
+        x_behind = x
+        v_behind = v
+
+    # The forces and the motion, from the front.
+    ended = int64(0)
+    ahead = 0.0
+    for k in range(CARS_MAX):
+        behind = tension[k]
+        force = actual[k]
+        force += gain[k] * (target[k] - force)
+        actual[k] = force
+        if force < 0.0:
+            force *= brake_fading[k]
+        pull = force - resistance[k] + ahead - behind
+        v = speed[k] + h * (pull * inverse_mass[k] + disturbance_m_s2)
+        x = position[k] + h * v
         speed[k] = v
-        position[k] = x + h * v
-        work += max(force, 0.0) * v
-        braking -= min(force, 0.0) * v
+        position[k] = x
+        traction_w[k] = max(force, 0.0) * v
+        braking_w[k] = min(force, 0.0) * v
+        ended |= int64(x >= until[k]) | int64(v < BRAKE_FULL_M_S and k < cars)
         ahead = behind
-    state.coupler_force_n = largest
+
+    work = 0.0
+    braking = 0.0
+    for k in range(CARS_MAX):
+        work += traction_w[k]
+        braking -= braking_w[k]
     state.traction_j += h * work
     state.braking_j += h * braking
+    return int64(1) - ended
 
 
 @step
@@ -201,20 +278,32 @@ def advance(
     params: Any, track: Any, state: Any, actuator_params: Any, actuator: Any, disturbance_m_s2: Any
 ) -> None:
     """The train one control period later; the actuators' channel k carries the force of car k."""
-    for kind in range(2):
-        for q in range(3):
-            swing = params.swing[kind, q] * state.phase[kind].sine
-            state.davis[kind, q] = params.value[kind, q] + swing
+    for k in range(CARS_MAX):
+        kind = int64(params.kind[k])
+        sine = state.phase[kind].sine
+        state.a[k] = params.value[kind, 0] + params.swing[kind, 0] * sine
+        state.b[k] = params.value[kind, 1] + params.swing[kind, 1] * sine
+        state.c[k] = params.value[kind, 2] + params.swing[kind, 2] * sine
+        target = actuator.target[k]
+        state.target_n[k] = target
+        state.actual_n[k] = actuator.actual[k]
+        state.gain[k] = lag_gain(target, actuator_params.traction_gain, actuator_params.brake_gain)
+        state.largest_n[k] = 0.0
     before = state.speed_m_s
-    state.coupler_force_n = 0.0
     for _ in range(params.substeps):
-        move(params, track, state, actuator_params, actuator, disturbance_m_s2)
+        if state.holds == 0:
+            state.holds = look_up(params, track, state)
+        state.holds &= move(params, state, disturbance_m_s2)
     show_ends(params, state)
     state.acceleration_m_s2 = (state.speed_m_s - before) / params.period_s
     total = 0.0
-    for k in range(params.cars):
-        total += actuator.actual[k]
+    largest = 0.0
+    for k in range(CARS_MAX):
+        actuator.actual[k] = state.actual_n[k]
+        total += state.actual_n[k]
+        largest = max(largest, state.largest_n[k])
     state.force_n = total
+    state.coupler_force_n = largest
     lumped.turn_phases(state.phase, params.rotation, 2)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 from numba.core.errors import NumbaError
 
 from ato_hil.can_dbc import step as step_module
-from ato_hil.can_dbc.step import Checked, step
+from ato_hil.can_dbc.step import Checked, step, vector_step
 
 LOW, HIGH = -(2**63), 2**63 - 1
 EDGES = st.sampled_from([LOW, LOW + 1, -(2**32), -1, 0, 1, 2**31, 2**32, HIGH - 1, HIGH])
@@ -199,11 +200,11 @@ def test_interpreted_codec_and_protection_give_the_bits_of_the_compiled_ones() -
 
 def test_an_interpreted_step_is_the_function_itself() -> None:
     code = (
-        "from ato_hil.can_dbc.step import Checked, int64, step\n"
+        "from ato_hil.can_dbc.step import Checked, int64, step, vector_step\n"
         "def function(): pass\n"
-        "print(step(function) is function, int64 is Checked)\n"
+        "print(step(function) is function, vector_step(function) is function, int64 is Checked)\n"
     )
-    assert python(code, ATO_HIL_INTERPRETED="1") == "True True\n"
+    assert python(code, ATO_HIL_INTERPRETED="1") == "True True True\n"
 
 
 def new_array(n):
@@ -218,12 +219,31 @@ def array_sum(a):
     return (a + a)[0]
 
 
+@pytest.mark.parametrize("decorator", [step, vector_step])
 @pytest.mark.parametrize(
     ("function", "argument"), [(new_array, 3), (new_list, 3), (array_sum, np.zeros(3))]
 )
-def test_a_step_that_would_allocate_is_refused(function: Any, argument: Any) -> None:
+def test_a_step_that_would_allocate_is_refused(
+    decorator: Any, function: Any, argument: Any
+) -> None:
+    level = numba.config.OPT
     with pytest.raises(NumbaError):
-        step(function)(argument)
+        decorator(function)(argument)
+    assert numba.config.OPT is level  # a vector step is compiled at another
+
+
+def halve(lanes):
+    for k in range(8):
+        lanes[k] = lanes[k] / 2.0 - lanes[k] * 0.1
+
+
+def test_a_vector_step_does_what_its_function_does() -> None:
+    level = numba.config.OPT
+    expected, found = np.linspace(-1.0, 7.0, 8), np.linspace(-1.0, 7.0, 8)
+    halve(expected)
+    vector_step(halve)(found)
+    assert found.tobytes() == expected.tobytes()
+    assert numba.config.OPT is level
 
 
 # What is kept between processes

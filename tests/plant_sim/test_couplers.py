@@ -1,11 +1,16 @@
 """Cars with elastic couplers: Newton's laws, the chain's modes, standstill, the rigid limit."""
 
+import re
+
+import llvmlite.binding as llvm
 import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ato_hil.can_dbc import cache
+from ato_hil.can_dbc.step import vector_step
 from ato_hil.plant_sim import actuator, plant
 from ato_hil.plant_sim.actuator import Actuator
 from ato_hil.plant_sim.scenario import load
@@ -289,3 +294,160 @@ def test_couplers_need_stiffness_and_damping(change):
     says = "coupler_stiffness_n_m, coupler_damping_n_s_m: expected above 0"
     with pytest.raises(msgspec.ValidationError, match=says):
         msgspec.convert(DATA | change, couplers.Train)
+
+
+# The lanes are the cars.
+
+
+def plain(rig, disturbance):
+    """A control period of a rig as the docstring of the module has it, car by car in plain Python:
+    what the state has afterwards, by field."""
+    params = rig.params["train"][0]
+    state = {name: rig.train[name].tolist() for name in rig.train.dtype.names}
+    gains = rig.params["actuator"][0]
+    target, actual = (
+        rig.state["actuator"][0][name][: rig.cars].tolist() for name in ("target", "actual")
+    )
+    x, v = rig.position.tolist(), rig.speed.tolist()
+    h, pitch, substeps = (params[name].item() for name in ("step_s", "pitch_m", "substeps"))
+    stiffness, damping = params["stiffness_n_m"].item(), params["damping_n_s_m"].item()
+    sines = state["phase"]
+    davis = [
+        [
+            params["value"][kind, q].item() + params["swing"][kind, q].item() * sines[kind][0]
+            for q in range(3)
+        ]
+        for kind in range(2)
+    ]
+    starts, resistances = rig.track["from_m"], rig.track["resistance_n_per_kn"].tolist()
+    largest, traction, braking = 0.0, state["traction_j"], state["braking_j"]
+    for _ in range(substeps):
+        work, taken, ahead = 0.0, 0.0, 0.0
+        for k in range(rig.cars):
+            behind = 0.0
+            if k < rig.cars - 1:
+                behind = stiffness * (x[k] - x[k + 1] - pitch) + damping * (v[k] - v[k + 1])
+                largest = max(largest, abs(behind))
+            gain = gains["traction_gain"] if target[k] > 0.0 else gains["brake_gain"]
+            actual[k] += gain.item() * (target[k] - actual[k])
+            force = actual[k]
+            if force < 0.0:
+                force *= min(max(v[k] / couplers.BRAKE_FULL_M_S, -1.0), 1.0)
+            a, b, c = davis[params["kind"][k]]
+            weak = min(max(v[k] / couplers.RESISTANCE_FULL_M_S, -1.0), 1.0)
+            level = resistances[np.searchsorted(starts, x[k], side="right") - 1]
+            resistance = params["weight_kn"][k].item() * (
+                a * weak + v[k] * (b + c * abs(v[k])) + level
+            )
+            pull = force - resistance + ahead - behind
+            v[k] += h * (pull * params["inverse_mass"][k].item() + disturbance)
+            x[k] += h * v[k]
+            work += max(force, 0.0) * v[k]
+            taken -= min(force, 0.0) * v[k]
+            ahead = behind
+        traction += h * work
+        braking += h * taken
+    return {
+        "position_m": x[0],
+        "speed_m_s": v[0],
+        "rear_position_m": x[-1],
+        "rear_speed_m_s": v[-1],
+        "acceleration_m_s2": (v[0] - state["speed_m_s"]) / params["period_s"].item(),
+        "force_n": sum(actual, 0.0),
+        "traction_j": traction,
+        "braking_j": braking,
+        "coupler_force_n": largest,
+        "car_position_m": x,
+        "car_speed_m_s": v,
+    }
+
+
+def bits(value):
+    return np.atleast_1d(np.asarray(value, np.float64)).view(np.int64).tolist()
+
+
+def assert_bits_of_plain(rig, force, periods, disturbance=0.0):
+    channels = rig.state["actuator"][0]
+    moves, pulls = rig.params["train"][0], rig.params["actuator"][0]
+    for _ in range(periods):
+        rig.state["node"]["command_n"][0, : rig.cars] = force
+        couplers.command(rig.params[0], rig.state[0])
+        actuator.shift(channels)
+        expected = plain(rig, disturbance)
+        couplers.advance(moves, rig.track, rig.train, pulls, channels, disturbance)
+        found = {name: rig.train[name] for name in expected}
+        found |= {"car_position_m": rig.position, "car_speed_m_s": rig.speed}
+        for name, value in expected.items():
+            assert bits(found[name]) == bits(value), name
+
+
+@st.composite
+def trains(draw):
+    """Data of a train of 1 to 8 cars."""
+    cars = draw(st.integers(1, 8))
+    each = {"min_size": cars, "max_size": cars}
+    return {
+        "masses_kg": draw(st.lists(st.floats(1e4, 8e4), **each)),
+        "effectiveness": [1.0] * cars,
+        "motor_cars": sorted(draw(st.sets(st.integers(1, cars), min_size=1))),
+        "coupler_sine_m": [0.0] * (cars - 1),
+        "coupler_cosine_m": [0.0] * (cars - 1),
+        "coupler_stiffness_n_m": draw(st.sampled_from([1e5, 1.5e7, 5e7])),
+        "coupler_damping_n_s_m": draw(st.sampled_from([1.0, 3e5])),
+        "substeps": draw(st.integers(1, 12)),
+    }
+
+
+# Where hills begin: anywhere, at a car, or where it will be soon.
+PLACES = st.floats(-170.0, 40.0) | st.builds(
+    lambda car, ahead: ahead - PITCH * car, st.integers(0, 7), st.sampled_from([0.0, 0.5, 1.0, 4.0])
+)
+SPEEDS = st.sampled_from([0.0, -0.0, 0.004, 0.02, 0.021, -0.01, -2.0, 0.3, 25.0])
+FORCES = st.sampled_from([0.0, -0.0, 2e4, 8e4, -1e3, -9e4])
+ACTUATORS = [
+    FREE,
+    Actuator(force_max_m_s2=1.2, lag_traction_s=0.2, lag_brake_s=0.05, delay_ticks=1),
+    Actuator(force_max_m_s2=1.2, lag_traction_s=0.2, jerk_max_m_s3=1.0),
+]
+
+
+@given(
+    trains(),
+    st.sampled_from(ACTUATORS),
+    st.lists(PLACES, max_size=6, unique=True),
+    st.data(),
+)
+@settings(max_examples=60, deadline=None)
+def test_the_motion_has_the_bits_of_each_car_by_itself(train, actuators, places, data):
+    hills = [30.0, -25.0, 4.0, 0.0, -8.0, 12.0][: len(places)]
+    track = Track(application="smeared", from_m=sorted(places), resistance_n_per_kn=hills)
+    rig = Rig(track=track, actuators=actuators, **train)
+    each = {"min_size": rig.cars, "max_size": rig.cars}
+    alike = st.sampled_from([0.021, 10.0, 25.0]).map(lambda speed: [speed] * rig.cars)
+    speeds = data.draw(st.lists(SPEEDS, **each) | alike)
+    rig.speed[:] = speeds
+    rig.train["speed_m_s"] = speeds[0]
+    for force in data.draw(st.lists(st.lists(FORCES, **each), min_size=1, max_size=4)):
+        assert_bits_of_plain(rig, force, 6, data.draw(st.sampled_from([0.0, 0.01, -0.02])))
+
+
+def test_a_hill_acts_from_its_very_place_on():
+    level = Rig(**SMOOTH)
+    level.speed[:] = 20.0
+    place = level.run(0.0, 3)[0][-1, 0]  # of the front, at the end of a period
+    hill = Track(application="smeared", from_m=[place], resistance_n_per_kn=[30.0])
+    rig = Rig(track=hill, **SMOOTH)
+    rig.speed[:] = 20.0
+    assert_bits_of_plain(rig, 0.0, 4)
+
+
+@pytest.mark.skipif(
+    not llvm.get_host_cpu_features().get("avx2"), reason="vectors of this machine are short"
+)
+def test_a_step_of_the_motion_is_vector_operations(monkeypatch):
+    monkeypatch.setattr(cache, "root", lambda: None)  # what is loaded cannot be looked at
+    rig = Rig()
+    move = vector_step(couplers.move.py_func)
+    assert move(rig.params[0]["train"], rig.train, 0.0) == 0  # cars at rest
+    code = move.inspect_llvm(move.signatures[0])
+    assert len(re.findall(r"fmul <\d+ x double>", code)) >= 10
