@@ -339,17 +339,11 @@ def run(
 
 
 def _refuse_what_has_no_effect(context: typer.Context, mode: Mode) -> None:
-    """Raises typer.Exit for an option that beside others has no effect."""
+    """Raises typer.Exit for an option that beside others has no effect. Bus, board and busy wait
+    are settings of a mode or pace, which who goes through them all may give each time."""
     asked = context.params
-    this = f", this is {mode.value}"
-    if mode is not Mode.hil:
-        refuse(context, f"needs mode hil{this}", "bus")
-    if mode is not Mode.pil:
-        refuse(context, f"needs mode pil{this}", "board")
     if mode is not Mode.fmu:
-        refuse(context, f"needs mode fmu{this}", "controller_fmu", "plant_fmu")
-    if asked["pace"] is not Pace.realtime:
-        refuse(context, "needs --pace realtime", "spin_us")
+        refuse(context, f"needs mode fmu, this is {mode.value}", "controller_fmu", "plant_fmu")
     if asked["no_trace"]:
         refuse(context, "has no effect with --no-trace", "view", "trace", "trace_mb")
     if asked["view"] is not None:

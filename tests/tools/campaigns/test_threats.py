@@ -190,7 +190,7 @@ def test_a_mailbox_differs_only_if_it_is_fresh() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(("mode", "frames"), [("sil", 1_000_000), ("hil", 100_000)])
 def test_the_whole_campaign(ato_hil, tmp_path: Path, mode: str, frames: int) -> None:
-    bus = ("--bus", f"hub:{tmp_path.name[-20:]}") if mode == "hil" else ()
+    bus = ("--bus", f"hub:{tmp_path.name[-20:]}")
     done = ato_hil("threats", "--mode", mode, *bus, "--out", "t", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "t" / "threats.json").read_text())
