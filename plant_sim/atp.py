@@ -452,7 +452,7 @@ def find_curves(limits: Any, state: Any, tick: Any, position_m: Any) -> None:
                     least = speed
                     state.target_speed_m_s = target.speed_m_s
                     state.target_distance_m = max(target.reach_m - position_m, 0.0)
-        elif state.target_distance_m == np.inf:
+        elif least == np.inf and target.reach_m - position_m < state.target_distance_m:
             state.target_speed_m_s = target.speed_m_s
             state.target_distance_m = target.reach_m - position_m
 

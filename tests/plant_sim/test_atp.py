@@ -412,6 +412,25 @@ def test_the_most_restrictive_target_is_told():
     assert told[4][1] == 0.0
 
 
+@pytest.mark.parametrize("lower_m", [500.0, 1000.0, 1700.0])
+def test_while_none_limits_the_next_target_is_told_whatever_it_is(lower_m):
+    known = atp.Atp(
+        supervision="etcs",
+        speeds=[
+            atp.StaticSpeed(until_m=800.0, speed_m_s=20.0),
+            atp.StaticSpeed(until_m=1400.0, speed_m_s=15.0),
+        ],
+        end_of_authority_m=2000.0,
+        temporary=[atp.TemporarySpeed(from_m=lower_m, to_m=lower_m + 100.0, speed_m_s=8.0)],
+    )
+    supervised = Supervisor(known)
+    ahead = sorted([(800.0, 15.0), (lower_m, 8.0), (2000.0, 0.0)])
+    supervised.at(0.0)
+    state = supervised.state[0]
+    assert state["target_speed_m_s"] == ahead[0][1]
+    assert ahead[0][0] - 100.0 < state["target_distance_m"] <= ahead[0][0]
+
+
 def test_without_a_target_none_is_told():
     supervised = Supervisor(atp.Atp(supervision="etcs"))
     supervised.at(0.0)
