@@ -36,6 +36,14 @@ def test_what_is_permitted_keeps_below_the_permitted_speed(speed_m_s: float) -> 
     assert run.row["atp_interventions"] == 0
 
 
+@pytest.mark.parametrize("speed_m_s", [3.0, 8.0, 12.0])
+def test_the_default_keeps_below_it_too(speed_m_s: float) -> None:
+    """Also where the line's own speeds and its end are further ahead."""
+    (run,) = in_process.runs(restricted(speed_m_s, 0.5), "cailc", 1)
+    assert run.row["overspeed_margin_m_s"] > 0.0
+    assert run.row["atp_interventions"] == 0
+
+
 def test_a_lower_speed_permits_less() -> None:
     found = [approach.hardest(restricted(v, 0.5), MARGIN_M_S).brake_m_s2 for v in (1.5, 3.0, 8.0)]
     assert found == sorted(found)
