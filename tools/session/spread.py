@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from typing import Any, NamedTuple
@@ -89,12 +89,18 @@ def spread(
 
 def _begin_tracker() -> None:
     """Python's own process that tracks what processes share ignores Ctrl-C and SIGTERM, but a
-    terminal that is closed would end it: the next one knows of nothing, and says so by a traceback.
-    What blocks a signal passes that on to its children."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+    terminal that is closed would end it: the next one knows of nothing, and says so by a
+    traceback."""
+    with _blocked(signal.SIGHUP), safe_path():
+        resource_tracker.ensure_running()
+
+
+@contextmanager
+def _blocked(number: signal.Signals) -> Iterator[None]:
+    """A process that is begun within it does not hear a signal."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
     try:
-        with safe_path():
-            resource_tracker.ensure_running()
+        yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
@@ -128,7 +134,9 @@ class _Worker:
             self.end()
         before = set(multiprocessing.active_children())
         spawn = multiprocessing.get_context("spawn")
-        with Interrupts() as interrupts, safe_path():  # a pool that is half begun cannot be ended
+        # A pool that is half begun cannot be ended, and a process that has no handler yet answers
+        # Ctrl-C with a traceback.
+        with Interrupts() as interrupts, safe_path(), _blocked(signal.SIGINT):
             self._pool = ProcessPoolExecutor(1, spawn, _begin)
             future = self._pool.submit(self._function, task.task)
         self._processes = set(multiprocessing.active_children()) - before
@@ -151,6 +159,7 @@ def _begin() -> None:
     """Ctrl-C is for the process that started this one, which then ends it; if that is killed, this
     one ends as well."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     parent = multiprocessing.parent_process()
     assert parent is not None
 
