@@ -44,13 +44,8 @@ def _in(loaded: Loaded, margin_m_s: float) -> Bound:
     at, planned = loaded.profile.position_m[::EVERY], loaded.profile.speed_m_s[::EVERY]
     permitted, left, towards = np.full((3, len(at)), np.inf)
     for target in limits.targets:
-        knots = limits.knots[target["first"][PERMITTED] : target["last"][PERMITTED]]
-        row = np.searchsorted(knots["from_m"], at, side="right") - 1
-        knot = knots[np.maximum(row, 0)]
-        square = knot["square"] - knot["slope"] * (at - knot["from_m"])
-        speed = np.sqrt(np.maximum(square, 0.0)) - knot["offset"]
-        speed = np.maximum(speed, target["floor_m_s"][PERMITTED])
-        least = (row >= 0) & (at < target["end_m"]) & (speed < permitted)
+        speed = curve(limits.knots, target, at)
+        least = (at < target["end_m"]) & (speed < permitted)
         permitted[least] = speed[least]
         left[least] = target["reach_m"] - at[least]
         towards[least] = target["speed_m_s"]
@@ -61,3 +56,15 @@ def _in(loaded: Loaded, margin_m_s: float) -> Bound:
     brake = ((v + margin_m_s) ** 2 - t**2) / (2 * (d - v))
     k = int(np.argmin(brake))
     return Bound(float(brake[k]), float(at[braking][k]), float(t[k]))
+
+
+def curve(knots: np.ndarray, target: np.void, at: np.ndarray) -> np.ndarray:
+    """`atp.curve_speed` of the permitted speed at many places, m/s."""
+    knots = knots[target["first"][PERMITTED] : target["last"][PERMITTED]]
+    if not len(knots):
+        return np.full(len(at), np.inf)
+    row = np.searchsorted(knots["from_m"], at, side="right") - 1
+    knot = knots[np.maximum(row, 0)]
+    square = knot["square"] - knot["slope"] * (at - knot["from_m"])
+    speed = np.sqrt(np.maximum(square, 0.0)) - knot["offset"]
+    return np.where(row >= 0, np.maximum(speed, target["floor_m_s"][PERMITTED]), np.inf)

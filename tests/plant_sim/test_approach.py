@@ -2,9 +2,11 @@
 
 import re
 
+import numpy as np
 import pytest
 
-from ato_hil.plant_sim import approach
+from ato_hil.can_dbc.step import rows
+from ato_hil.plant_sim import approach, atp, world
 from ato_hil.plant_sim.scenario import Loaded, ScenarioError, load, overlaid
 from ato_hil.tools.runs.onboard import calibration_for
 from ato_hil.tools.session import in_process
@@ -42,6 +44,14 @@ def test_the_default_keeps_below_it_too(speed_m_s: float) -> None:
     (run,) = in_process.runs(restricted(speed_m_s, 0.5), "cailc", 1)
     assert run.row["overspeed_margin_m_s"] > 0.0
     assert run.row["atp_interventions"] == 0
+
+
+def test_the_curves_are_those_of_atp() -> None:
+    limits = world.tables(restricted(8.0, 0.5))
+    at = np.linspace(0.0, 3000.0, 61)
+    for target in rows(limits.targets):
+        theirs = [atp.curve_speed(rows(limits.knots), target, atp.PERMITTED, x) for x in at]
+        assert (approach.curve(limits.knots, target, at) == theirs).all()
 
 
 def test_a_lower_speed_permits_less() -> None:
