@@ -59,8 +59,7 @@ class Tables:
 
     chance: Any  # [trains, ticks] of plant.CHANCE
     truth: Any  # [trains, ticks] of plant.TRUTH
-    frames: np.ndarray  # [trains, rows] of FRAME
-    logged: Any  # the same, as steps take it
+    frames: Any  # [trains, rows] of FRAME
     counts: np.ndarray  # [trains], rows so far
 
     def log(self, train: int, frames: list[tuple[int, int, int]]) -> None:
@@ -137,7 +136,7 @@ def run_line(
         # As many rows as there could be; the system gives memory to those that are written.
         frames = np.empty((len(nodes), truth.shape[1] * MESSAGE_COUNT), FRAME)
         counts = np.zeros(len(nodes), np.int64)
-        tables = Tables(chance, rows(truth), frames, rows(frames), counts)
+        tables = Tables(chance, rows(truth), rows(frames), counts)
         started = time.perf_counter()
         cut = _drive(here, sides, number, tables, drive, watch)
         seconds = time.perf_counter() - started
@@ -190,7 +189,7 @@ def _drive_compiled(
 ) -> None:
     """Ticks in which no rule touches anything."""
     before = tables.counts.copy()
-    drive(first, end, tables.chance, tables.truth, tables.logged, tables.counts)
+    drive(first, end, tables.chance, tables.truth, tables.frames, tables.counts)
     here.tx["fresh"].fill(0)
     here.rx["fresh"].fill(0)
     for side in sides:

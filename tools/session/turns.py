@@ -27,13 +27,7 @@ def on_one_core(processes: Iterable[int], with_this_thread: bool = False) -> Ite
     threads = [thread for process in processes for thread in threads_of(process)]
     if threads and with_this_thread:
         threads.append(threading.get_native_id())
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
-    if not threads or len(cores) == 1:
-        cores = []
-    if cores:
-        last = last_core(threads[0])
-        cores.sort(key=lambda core: (core < last, core))
-    with locks.core_held(cores) as core:
+    with locks.core_held(_candidates(threads[0]) if threads else []) as core:
         before: dict[int, set[int]] = {}
         if core is not None:
             for thread in threads:
@@ -46,6 +40,14 @@ def on_one_core(processes: Iterable[int], with_this_thread: bool = False) -> Ite
             for thread, its_cores in before.items():
                 with suppress(OSError):
                     os.sched_setaffinity(thread, its_cores)
+
+
+def _candidates(first: int) -> list[int]:
+    """The cores that this process may use, from the one on which a thread was last; none if there
+    is no choice."""
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
+    last = last_core(first)
+    return sorted(cores, key=lambda core: (core < last, core)) if len(cores) > 1 else []
 
 
 def threads_of(process: int) -> list[int]:

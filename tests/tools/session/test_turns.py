@@ -19,7 +19,8 @@ from ato_hil.tools.session.options import Silent
 from ato_hil.tools.session.turns import last_core, on_one_core, threads_of
 
 pytestmark = pytest.mark.skipif(
-    not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2, reason="one core"
+    not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2,
+    reason="to be kept on one core a process needs two",
 )
 WITH_THREADS = """
 import sys, threading
